@@ -1,0 +1,191 @@
+"""Closest points of a triangle mesh, and of the smooth surface that its vertices lie on."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray as Array
+from scipy.spatial import cKDTree
+
+from jaxsurf.shapes.meshes import TriangleMesh
+
+
+class ClosestPoint:
+    """Exact closest points on a triangle mesh, for many points at once.
+
+    Args:
+        mesh: the mesh; long triangles are no worse than others.
+    """
+
+    def __init__(self, mesh: TriangleMesh):
+        self.mesh = mesh
+        self._corners = mesh.vertices[mesh.triangles]
+        centers, parents, self._reach = _cover(self._corners)
+        self._parents = parents
+        self._tree = cKDTree(centers)
+
+    def __call__(
+        self, points: Float[Array, "q 3"]
+    ) -> tuple[Float[Array, "q 3"], Int[Array, " q"], Float[Array, "q 3"]]:
+        """Closest points, the triangles they are on, and their barycentric coordinates."""
+        q = len(points)
+        place, triangle, bary = np.empty((q, 3)), np.zeros(q, np.int64), np.empty((q, 3))
+        todo, k = np.arange(q), 12
+        while todo.size:
+            k = min(k, self._tree.n)
+            distance, index = self._tree.query(points[todo], k=range(1, k + 1))
+            candidates = self._parents[index]
+            found, weights = _closest_on_triangles(points[todo][:, None], self._corners[candidates])
+            gap = np.linalg.norm(found - points[todo][:, None], axis=2)
+            best = np.argmin(gap, axis=1)
+            row = np.arange(len(todo))
+            place[todo], bary[todo] = found[row, best], weights[row, best]
+            triangle[todo] = candidates[row, best]
+            # A triangle not looked at keeps its centre beyond the last one, so none of its
+            # points is nearer than that distance less its reach.
+            sure = (gap[row, best] <= distance[:, -1] - self._reach) | (k == self._tree.n)
+            todo, k = todo[~sure], 4 * k
+        return place, triangle, bary
+
+    def normals(self, triangle: Int[Array, " q"], bary: Float[Array, "q 3"]) -> Float[Array, "q 3"]:
+        """Vertex normals carried linearly to the places given by `__call__`."""
+        corner = self.mesh.vertex_normals[self.mesh.triangles[triangle]]
+        normal = np.einsum("qi,qij->qj", bary, corner)
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        return normal / np.where(length > 0, length, 1)
+
+
+def _cover(corners):
+    """Centres of pieces of triangles, all within one small reach of every point of them."""
+    parents = np.arange(len(corners))
+    limit = 2 * np.median(_reach(corners))
+    done, whose = [], []
+    for _ in range(12):
+        long = _reach(corners) > limit
+        done.append(corners[~long].mean(axis=1))
+        whose.append(parents[~long])
+        corners, parents = corners[long], parents[long]
+        if not len(corners):
+            return np.concatenate(done), np.concatenate(whose), limit
+        a, b, c = corners.swapaxes(0, 1)
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        quarters = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+        corners = np.concatenate([np.stack(t, axis=1) for t in quarters])
+        parents = np.tile(parents, 4)
+    done.append(corners.mean(axis=1))
+    whose.append(parents)
+    return np.concatenate(done), np.concatenate(whose), float(_reach(corners).max())
+
+
+def _reach(corners):
+    return np.linalg.norm(corners - corners.mean(axis=1, keepdims=True), axis=2).max(axis=1)
+
+
+def _closest_on_triangles(point, corners):
+    """Closest point of each triangle `(..., 3, 3)`, with barycentric coordinates."""
+    a, b, c = np.moveaxis(corners, -2, 0)
+    u, v, w = b - a, c - a, point - a
+    uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)
+    wu, wv = _dot(w, u), _dot(w, v)
+    det = uu * vv - uv * uv
+    flat = det <= 1e-14 * uu * vv
+    det = np.where(flat, 1, det)
+    s, t = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
+    inside = (s >= 0) & (t >= 0) & (s + t <= 1) & ~flat
+    best = np.stack([1 - s - t, s, t], axis=-1)
+    best_gap = np.where(inside, 0, np.inf)
+    # Outside the triangle the closest point is on one of its sides.
+    for i in range(3):
+        p, d = (a, b, c)[i], (b, c, a)[i] - (a, b, c)[i]
+        length = _dot(d, d)
+        r = np.clip(_dot(point - p, d) / np.where(length > 0, length, 1), 0, 1)
+        gap = _dot(p + r[..., None] * d - point, p + r[..., None] * d - point)
+        side = np.zeros(best.shape)
+        side[..., i], side[..., (i + 1) % 3] = 1 - r, r
+        closer = gap < best_gap
+        best = np.where(closer[..., None], side, best)
+        best_gap = np.where(closer, gap, best_gap)
+    return np.einsum("...i,...ij->...j", best, corners), best
+
+
+def _dot(a, b):
+    return np.einsum("...i,...i->...", a, b)
+
+
+def fit_surface(
+    points: Float[Array, "q 3"],
+    normals: Float[Array, "q 3"],
+    *,
+    vertices: Float[Array, "n 3"],
+    vertex_normals: Float[Array, "n 3"],
+    degree: int,
+) -> tuple[Float[Array, "q 3"], Float[Array, "q 3"], Int[Array, " q"]]:
+    """Move points along their normals onto local polynomial fits of the vertices.
+
+    Around each point the nearest vertices on the same sheet (normals within 75 degrees) are
+    fitted by a height polynomial over the tangent plane, with weights that decay from the
+    point; its value at the point is the new position, its slope the new normal. Twice, the
+    second time over the improved plane. Where the vertices do not determine a polynomial of
+    this degree, the highest lower degree that they do determine is taken.
+
+    Args:
+        points: places near the surface, `(q, 3)`.
+        normals: unit normals there, `(q, 3)`.
+        vertices: points of the surface, `(n, 3)`.
+        vertex_normals: their unit normals, `(n, 3)`.
+        degree: degree of the polynomials.
+
+    Returns:
+        New points, new normals, and the degree used at each point (0: left where it was).
+    """
+    points, normals = points.copy(), normals.copy()
+    tree = cKDTree(vertices)
+    used = np.zeros(len(points), np.int64)
+    for block in np.array_split(np.arange(len(points)), max(1, len(points) // 2048)):
+        todo, p = block, degree
+        while todo.size and p > 0:
+            x, m, good = points[todo], normals[todo], np.ones(len(todo), bool)
+            for _ in range(2):
+                x, m, solved = _fit_once(x, m, tree, vertices, vertex_normals, p)
+                good &= solved
+            points[todo[good]], normals[todo[good]], used[todo[good]] = x[good], m[good], p
+            todo, p = todo[~good], p - 1
+    return points, normals, used
+
+
+def _fit_once(points, normals, tree, vertices, vertex_normals, degree):
+    size = math.comb(degree + 2, 2)
+    k = min(2 * size + 4, tree.n)
+    far, index = tree.query(points, k=range(1, k + 1))
+    tangent, other = _tangents(normals)
+    offset = vertices[index] - points[:, None]
+    radius = far[:, -1:]
+    x = np.einsum("qkd,qd->qk", offset, tangent) / radius
+    y = np.einsum("qkd,qd->qk", offset, other) / radius
+    z = np.einsum("qkd,qd->qk", offset, normals) / radius
+    same = np.einsum("qkd,qd->qk", vertex_normals[index], normals) > 0.25
+    weight = np.where(same, np.exp(-2.5 * (x**2 + y**2 + z**2)), 0)
+    powers = [(i - j, j) for i in range(degree + 1) for j in range(i + 1)]
+    basis = np.stack([x**i * y**j for i, j in powers], axis=-1)
+    enough = same.sum(axis=1) >= size + 2
+    q, r = np.linalg.qr(basis * weight[..., None])
+    diagonal = np.abs(np.diagonal(r, axis1=1, axis2=2))
+    enough &= diagonal.min(axis=1) > 1e-5 * diagonal.max(axis=1)
+    r[~enough] = np.eye(size)
+    rhs = np.einsum("qki,qk->qi", q, z * weight)
+    c = np.linalg.solve(r, rhs[..., None])[..., 0]
+    # A fit that lifts a point by more than the distance between vertices is no fit.
+    enough &= np.abs(c[:, 0]) < 1 / math.sqrt(k)
+    c[~enough] = 0
+    new = points + c[:, :1] * radius * normals
+    normal = normals - c[:, 1:2] * tangent - c[:, 2:3] * other
+    return new, normal / np.linalg.norm(normal, axis=1, keepdims=True), enough
+
+
+def _tangents(normals):
+    axis = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    tangent = np.cross(normals, axis)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    return tangent, np.cross(normals, tangent)

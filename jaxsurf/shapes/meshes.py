@@ -1,0 +1,295 @@
+"""Triangle meshes on the host: what they are made of, how they are cleaned, closest points."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray as Array
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from jaxsurf.cloud import raise_at
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """An oriented triangle mesh, closed or with borders, in NumPy arrays on the host.
+
+    Args:
+        vertices: positions, `(n, 3)`.
+        triangles: three vertex numbers each, counted from 0 and counter-clockwise seen from
+            the side that the normals point to, `(m, 3)`.
+
+    Raises:
+        ValueError: wrong shapes, non-finite vertices (index named), vertex numbers out of
+            range, triangles that name a vertex twice, edges shared by more than two triangles,
+            neighbouring triangles of opposite orientation. `clean_mesh` repairs what can be.
+
+    Example:
+        >>> tetrahedron = js.TriangleMesh(
+        ...     np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]),
+        ...     np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]),
+        ... )
+        >>> tetrahedron.closed, tetrahedron.genus, round(tetrahedron.volume, 4)
+        (True, 0, 0.1667)
+    """
+
+    vertices: Float[Array, "n 3"]
+    triangles: Int[Array, "m 3"]
+
+    def __post_init__(self):
+        object.__setattr__(self, "vertices", np.asarray(self.vertices, float))
+        object.__setattr__(self, "triangles", np.asarray(self.triangles, np.int64))
+        _check_arrays(self.vertices, self.triangles)
+        t = self.triangles
+        twice = (t[:, 0] == t[:, 1]) | (t[:, 1] == t[:, 2]) | (t[:, 2] == t[:, 0])
+        raise_at(twice, "triangle {i} names a vertex twice: {v}", t)
+        _check_manifold(self.edge_table)
+        turned = np.flatnonzero((self.edge_table.faces[:, 1] >= 0) & ~self.edge_table.consistent)
+        if turned.size:
+            a, b = self.edge_table.faces[turned[0]]
+            raise ValueError(
+                f"triangles {a} and {b} have opposite orientation across their common edge"
+                f" ({turned.size} such edges); clean_mesh turns them round"
+            )
+
+    @cached_property
+    def edge_table(self) -> EdgeTable:
+        """Every edge once, with the triangles on its two sides."""
+        return EdgeTable.of(self.triangles, len(self.vertices))
+
+    @cached_property
+    def _area_vectors(self) -> Float[Array, "m 3"]:
+        a, b, c = np.moveaxis(self.vertices[self.triangles], 1, 0)
+        return 0.5 * np.cross(b - a, c - a)
+
+    @cached_property
+    def areas(self) -> Float[Array, " m"]:
+        """Area of every triangle."""
+        return np.linalg.norm(self._area_vectors, axis=1)
+
+    @property
+    def area(self) -> float:
+        """Area of the whole surface."""
+        return float(self.areas.sum())
+
+    @property
+    def volume(self) -> float:
+        """Volume enclosed by a closed mesh; negative where the normals point inwards."""
+        if not self.closed:
+            raise ValueError(f"no volume: the mesh has {len(self.border_edges)} border edges")
+        corner = self.vertices[self.triangles[:, 0]] - self.vertices.mean(axis=0)
+        return float(np.sum(corner * self._area_vectors) / 3)
+
+    @cached_property
+    def vertex_normals(self) -> Float[Array, "n 3"]:
+        """Unit normals at the vertices: those of the triangles around, weighted by angle.
+
+        Only first-order accurate on irregular meshes; NaN at a vertex of no triangle.
+        """
+        corners = self.vertices[self.triangles]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            unit = self._area_vectors / self.areas[:, None]
+            total = np.zeros_like(self.vertices)
+            for i in range(3):
+                a = corners[:, (i + 1) % 3] - corners[:, i]
+                b = corners[:, (i + 2) % 3] - corners[:, i]
+                angle = np.arctan2(2 * self.areas, np.sum(a * b, axis=1))
+                share = np.where(self.areas[:, None] > 0, angle[:, None] * unit, 0)
+                np.add.at(total, self.triangles[:, i], share)
+            return total / np.linalg.norm(total, axis=1, keepdims=True)
+
+    @cached_property
+    def border_edges(self) -> Int[Array, "b 2"]:
+        """Edges with a triangle on one side only, as pairs of vertices."""
+        table = self.edge_table
+        return table.ends[table.faces[:, 1] < 0]
+
+    @cached_property
+    def border_vertices(self) -> Bool[Array, " n"]:
+        """True for the vertices of border edges."""
+        flag = np.zeros(len(self.vertices), bool)
+        flag[self.border_edges] = True
+        return flag
+
+    @property
+    def closed(self) -> bool:
+        """True if no edge is a border."""
+        return len(self.border_edges) == 0
+
+    @property
+    def euler_characteristic(self) -> int:
+        """Vertices − edges + triangles, counting only vertices that a triangle uses."""
+        return len(np.unique(self.triangles)) - len(self.edge_table.ends) + len(self.triangles)
+
+    @cached_property
+    def components(self) -> Int[Array, " m"]:
+        """Number of the connected piece that each triangle belongs to, from 0."""
+        inner = self.edge_table.faces[self.edge_table.faces[:, 1] >= 0]
+        return csgraph.connected_components(_graph(inner, len(self.triangles)), directed=False)[1]
+
+    @property
+    def genus(self) -> int:
+        """Handles, summed over the pieces; every border loop counts as filled with a disk."""
+        loops = csgraph.connected_components(
+            _graph(self.border_edges, len(self.vertices)), directed=False
+        )[1]
+        borders = len(np.unique(loops[self.border_vertices]))
+        pieces = int(self.components.max()) + 1
+        return (2 * pieces - borders - self.euler_characteristic) // 2
+
+    @property
+    def edge_length(self) -> float:
+        """Mean length of the edges."""
+        a, b = self.vertices[self.edge_table.ends].swapaxes(0, 1)
+        return float(np.linalg.norm(a - b, axis=1).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeTable:
+    """The edges of a triangle list.
+
+    Args:
+        ends: the two vertices, `(e, 2)`, the lower number first.
+        faces: the triangles on both sides, `(e, 2)`; −1 where there is none.
+        count: number of triangles that share the edge, `(e,)`.
+        consistent: True where the two triangles run through the edge in opposite directions,
+            as they do when both are seen from the same side.
+    """
+
+    ends: Int[Array, "e 2"]
+    faces: Int[Array, "e 2"]
+    count: Int[Array, " e"]
+    consistent: Bool[Array, " e"]
+
+    @staticmethod
+    def of(triangles: Int[Array, "m 3"], n: int) -> EdgeTable:
+        start, stop = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+        face = np.repeat(np.arange(len(triangles)), 3)
+        key = np.minimum(start, stop) * n + np.maximum(start, stop)
+        order = np.argsort(key, kind="stable")
+        unique, first, count = np.unique(key[order], return_index=True, return_counts=True)
+        one, two = order[first], order[np.minimum(first + 1, len(order) - 1)]
+        paired = count >= 2
+        faces = np.stack([face[one], np.where(paired, face[two], -1)], axis=1)
+        ends = np.stack([unique // n, unique % n], axis=1)
+        return EdgeTable(ends, faces, count, paired & (start[one] != start[two]))
+
+
+def clean_mesh(
+    vertices: Float[Array, "n 3"], triangles: Int[Array, "m 3"], *, name: str = "mesh"
+) -> tuple[TriangleMesh, Int[Array, " kept"]]:
+    """Mesh from raw arrays, every repair stated in a warning.
+
+    Vertices at exactly equal positions become one, triangles that then name a vertex twice
+    are dropped, so are vertices that no triangle uses, and triangles that are turned the
+    wrong way round are turned back (as few as possible in each connected piece).
+
+    Args:
+        vertices: positions, `(n, 3)`.
+        triangles: vertex numbers from 0, `(m, 3)`.
+        name: what to call the mesh in warnings and errors.
+
+    Returns:
+        The mesh, and for each of its vertices the row of `vertices` that it was.
+
+    Raises:
+        ValueError: as `TriangleMesh`; no triangle left; not orientable (a Möbius band).
+    """
+    vertices = np.asarray(vertices, float)
+    triangles = np.asarray(triangles, np.int64)
+    try:
+        _check_arrays(vertices, triangles)
+        first, inverse = _merge_equal(vertices)
+        merged = len(vertices) - len(first)
+        triangles = inverse[triangles]
+        a, b, c = triangles.T
+        collapsed = (a == b) | (b == c) | (c == a)
+        triangles = triangles[~collapsed]
+        if not len(triangles):
+            raise ValueError("no triangles")
+        used, triangles = np.unique(triangles, return_inverse=True)
+        triangles = triangles.reshape(-1, 3)
+        unused = np.setdiff1d(np.arange(len(first)), used)
+        kept = first[used]
+        _check_manifold(EdgeTable.of(triangles, len(used)))
+        flip = _faces_to_flip(triangles, len(used))
+        triangles[flip] = triangles[flip][:, ::-1]
+        mesh = TriangleMesh(vertices[kept], triangles)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+    for count, text in (
+        (merged, "{} vertices at exactly the position of another merged with it"),
+        (collapsed.sum(), "{} triangles without area (a vertex named twice) dropped"),
+        (unused.size, f"{{}} vertices belong to no triangle, dropped (first: {first[unused[:1]]})"),
+        (flip.sum(), "{} triangles turned round to agree with their neighbours"),
+    ):
+        if count:
+            warnings.warn(f"{name}: " + text.format(count), stacklevel=3)
+    return mesh, kept
+
+
+def _check_arrays(vertices, triangles):
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise ValueError(f"vertices must have shape (n, 3), not {vertices.shape}")
+    if triangles.ndim != 2 or triangles.shape[1] != 3:
+        raise ValueError(f"triangles must have shape (m, 3), not {triangles.shape}")
+    raise_at(~np.isfinite(vertices).all(axis=1), "vertex {i} is not finite: {v}", vertices)
+    outside = ((triangles < 0) | (triangles >= len(vertices))).any(axis=1)
+    text = f"triangle {{i}} names the vertices {{v}} (from 0), but there are {len(vertices)}"
+    raise_at(outside, text, triangles)
+
+
+def _check_manifold(table: EdgeTable):
+    many = np.flatnonzero(table.count > 2)
+    if many.size:
+        i, j = table.ends[many[0]]
+        raise ValueError(
+            f"{many.size} edges are shared by more than two triangles (first: vertices {i} and"
+            f" {j}, {table.count[many[0]]} triangles)"
+        )
+
+
+def _merge_equal(points: Float[Array, "n d"]) -> tuple[Int[Array, " u"], Int[Array, " n"]]:
+    """First row of every distinct point, in order of appearance, and each row's place there."""
+    order = np.lexsort(points.T)  # stable, so equal rows stay in order of appearance
+    new = np.ones(len(points), bool)
+    new[1:] = (points[order[1:]] != points[order[:-1]]).any(axis=1)
+    first = np.empty(len(points), np.int64)
+    first[order] = order[new][np.cumsum(new) - 1]
+    kept = np.unique(first)
+    return kept, np.searchsorted(kept, first)
+
+
+def _faces_to_flip(triangles: Int[Array, "m 3"], n: int) -> Bool[Array, " m"]:
+    # Two sheets, one for each orientation of every triangle: an edge links equal sheets where
+    # its triangles agree and opposite sheets where they do not. A piece is orientable exactly
+    # if its two sheets stay apart.
+    m, table = len(triangles), EdgeTable.of(triangles, n)
+    inner = table.faces[:, 1] >= 0
+    (a, b), agree = table.faces[inner].T, table.consistent[inner]
+    links = np.concatenate(
+        [
+            np.stack([a, np.where(agree, b, b + m)], axis=1),
+            np.stack([a + m, np.where(agree, b + m, b)], axis=1),
+        ]
+    )
+    sheets = csgraph.connected_components(_graph(links, 2 * m), directed=False)[1]
+    as_given, turned = sheets[:m], sheets[m:]
+    bad = np.flatnonzero(as_given == turned)
+    if bad.size:
+        raise ValueError(
+            "the surface has only one side (a Möbius band or worse): no orientation of the"
+            f" {bad.size} triangles joined to triangle {bad[0]} is consistent"
+        )
+    votes = np.bincount(as_given, minlength=sheets.max() + 1)
+    tie = (votes[as_given] == votes[turned]) & (as_given > turned)
+    return (votes[as_given] < votes[turned]) | tie
+
+
+def _graph(links: Int[Array, "e 2"], n: int) -> sparse.coo_array:
+    return sparse.coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))

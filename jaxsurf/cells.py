@@ -1,0 +1,267 @@
+"""Neighbour search on the device, for points that move: a hashed list of cells."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .cloud import is_concrete
+from .neighbors import Neighbors, cosine_slack
+
+# Cells are a little wider than the radius, so that rounding puts no neighbour two cells away.
+_MARGIN = 1.01
+
+
+class SearchCapacity(NamedTuple):
+    """Sizes of the arrays of a search; they are part of the compiled program.
+
+    Args:
+        k: slots per row.
+        candidates: points in the 3^d cells around a point.
+    """
+
+    k: int
+    candidates: int
+
+
+class SearchReport(eqx.Module):
+    """What a search needed and what it had: both searches agree if nothing overflowed.
+
+    Args:
+        k: slots per row that were available.
+        k_needed: largest number of neighbours within the radius; for the k nearest, k.
+        k_found: least number of neighbours found, for the k nearest (k_needed otherwise).
+        candidates: candidates per point that were available.
+        candidates_needed: largest number of points in the cells around a point.
+        point: the point that needed most.
+    """
+
+    k: int = eqx.field(static=True)
+    candidates: int = eqx.field(static=True)
+    k_needed: Int[Array, ""]
+    k_found: Int[Array, ""]
+    candidates_needed: Int[Array, ""]
+    point: Int[Array, ""]
+
+    @property
+    def overflow(self) -> Bool[Array, ""]:
+        """True if neighbours are missing."""
+        return (
+            (self.k_needed > self.k)
+            | (self.candidates_needed > self.candidates)
+            | (self.k_found < self.k_needed)
+        )
+
+    def check(self) -> None:
+        """Raise a ValueError with the numbers needed and available; outside jit."""
+        if self.candidates_needed > self.candidates:
+            raise ValueError(
+                f"point {self.point} has {self.candidates_needed} points in the cells around it, "
+                f"capacity is {self.candidates} candidates"
+            )
+        if self.k_needed > self.k:
+            raise ValueError(
+                f"point {self.point} has {self.k_needed} neighbours within the radius, "
+                f"capacity is {self.k}"
+            )
+        if self.k_found < self.k_needed:
+            raise ValueError(
+                f"a point has {self.k_found} neighbours within the radius, "
+                f"{self.k_needed} are needed: enlarge the radius"
+            )
+
+
+def allocate(
+    points: Float[Array, "n d"],
+    radius: float,
+    *,
+    active: Bool[Array, " n"] | None = None,
+    margin: float = 1.25,
+) -> SearchCapacity:
+    """Capacity for `search_neighbors` on these points, with room to move.
+
+    Args:
+        points: typical positions, concrete.
+        radius: search radius, in the units of `points`.
+        active: False for rows that are switched off.
+        margin: factor on what these points need.
+
+    Returns:
+        Number of slots and of candidates. Whatever the normals reject is counted too.
+
+    Raises:
+        ValueError: traced points, or a radius that is not positive.
+
+    Example:
+        >>> x = jnp.stack([jnp.arange(10.0), jnp.zeros(10)], axis=1)
+        >>> js.allocate(x, 2.5, margin=1)
+        SearchCapacity(k=5, candidates=8)
+    """
+    if not is_concrete(points, active):
+        raise ValueError("allocate needs concrete points: call it outside jit")
+    if not radius > 0:
+        raise ValueError(f"radius is {radius}, expected a positive number")
+    points = jnp.asarray(points)
+    _, length, _ = _candidates(points, radius, _all_on(points, active))
+    most = int(length.sum(axis=1).max())
+    _, report = search_neighbors(
+        points, radius=radius, capacity=SearchCapacity(1, most), active=active, throw=False
+    )
+    return SearchCapacity(
+        min(len(points), math.ceil(margin * int(report.k_needed))),
+        min(len(points), math.ceil(margin * most)),
+    )
+
+
+@eqx.filter_jit
+def search_neighbors(
+    points: Float[Array, "n d"],
+    *,
+    radius: float | Float[Array, ""],
+    capacity: SearchCapacity,
+    k: int | None = None,
+    normals: Float[Array, "n d"] | None = None,
+    active: Bool[Array, " n"] | None = None,
+    min_cosine: float = 0.0,
+    throw: bool = True,
+    batch_size: int = 1024,
+) -> tuple[Neighbors, SearchReport]:
+    r"""Neighbours within a radius, found on the device, under jit, for points that move.
+
+    The same sets in the same order as `find_neighbors`, up to distances that round-off
+    decides. Points are sorted by the cell of a grid that they lie in; each looks into the
+    3^d cells around it. Cells are hashed, so that neither the extent of the cloud nor its
+    distance from the origin matters.
+
+    Args:
+        points: `(n, d)`, d = 2 or 3.
+        radius: neighbours are at most this far away; one number, may be traced.
+        capacity: array sizes, from `allocate`.
+        k: take only the k nearest of those within the radius.
+        normals: `(n, d)`; if given, neighbours have $n_i\cdot n_j \ge$ `min_cosine`.
+        active: False for rows that are switched off, `(n,)`.
+        min_cosine: least cosine between the normals of neighbours.
+        throw: raise when the capacity is exceeded, also from within jit.
+        batch_size: points treated at a time; bounds the memory.
+
+    Returns:
+        Neighbour lists with `capacity.k` slots (or k), and what was needed and available. If
+        `report.overflow`, neighbours are missing; `report.check()` gives the numbers.
+
+    Differentiable: the lists are integers; no derivative flows through the search.
+    Raises:
+        ValueError: normals or k that do not fit (both numbers given).
+        RuntimeError: capacity exceeded and `throw`.
+
+    Example:
+        >>> x = jnp.stack([jnp.arange(10.0), jnp.zeros(10)], axis=1)
+        >>> neighbors, report = js.search_neighbors(x, radius=2.5, capacity=js.allocate(x, 2.5))
+        >>> neighbors.indices[4, :5].tolist(), int(report.k_needed)
+        ([4, 3, 5, 2, 6], 5)
+    """
+    n, _ = points.shape
+    if normals is not None and normals.shape != points.shape:
+        raise ValueError(f"normals have shape {normals.shape}, points {points.shape}")
+    slots = capacity.k if k is None else k
+    if k is not None and not 2 <= k <= capacity.candidates:
+        raise ValueError(f"k = {k} neighbours, 2 to {capacity.candidates} candidates allowed")
+    points = jax.lax.stop_gradient(points)
+    normals = None if normals is None else jax.lax.stop_gradient(normals)
+    radius = jax.lax.stop_gradient(jnp.asarray(radius, points.dtype))
+    on = _all_on(points, active)
+    start, length, order = _candidates(points, radius, on)
+    limit = _distance_key(radius * radius)
+    last = jnp.iinfo(limit.dtype).max
+
+    def row(i, start, length):
+        # Slot t of the candidates lies in the cell whose run of slots has not ended before t.
+        ends = jnp.cumsum(length)
+        t = jnp.arange(capacity.candidates)
+        cell = jnp.searchsorted(ends, t, side="right", method="compare_all")
+        cell = jnp.minimum(cell, len(length) - 1)
+        j = order.at[(start - (ends - length))[cell] + t].get(mode="clip")
+        d = points[j] - points[i]
+        key = _distance_key(jnp.sum(d * d, axis=1))
+        good = (t < ends[-1]) & (key <= limit) & on[i]
+        if normals is not None:
+            good &= jnp.sum(normals[j] * normals[i], axis=1) >= (
+                min_cosine - cosine_slack(points.dtype)
+            )
+        good |= (j == i) & (t < ends[-1]) & on[i]
+        key = jnp.where(good, jnp.where(j == i, -1, key), last)
+        key, j = jax.lax.sort((key, j), num_keys=2)
+        mask = key[:slots] < last
+        j = jnp.where(mask, j[:slots], i)
+        return _pad(j, slots, i), _pad(mask, slots, False), good.sum()
+
+    rows = (jnp.arange(n, dtype=jnp.int32), start, length)
+    indices, mask, count = jax.lax.map(
+        lambda a: row(*a), rows, batch_size=min(batch_size, max(n, 1))
+    )
+    needed = length.sum(axis=1)
+    full = jnp.asarray(slots, count.dtype)
+    report = SearchReport(
+        k=slots,
+        candidates=capacity.candidates,
+        k_needed=count.max() if k is None else full,
+        k_found=count.max() if k is None else jnp.min(jnp.where(on, count, full)),
+        candidates_needed=needed.max(),
+        point=jnp.where(
+            needed.max() > capacity.candidates, jnp.argmax(needed), jnp.argmax(count)
+        ),
+    )
+    neighbors = Neighbors(indices, mask, radius if k is None else None)
+    if throw:
+        neighbors = eqx.error_if(
+            neighbors,
+            report.overflow,
+            f"neighbour search: {slots} slots and {capacity.candidates} candidates per point are "
+            "not enough, or the radius is too small for k; `throw=False` and `report.check()` "
+            "give the numbers needed",
+        )
+    return neighbors, report
+
+
+def _all_on(points, active) -> Bool[Array, " n"]:
+    return jnp.ones(len(points), bool) if active is None else jnp.asarray(active, bool)
+
+
+def _pad(row, width: int, value):
+    return jnp.pad(row, (0, width - len(row)), constant_values=value) if len(row) < width else row
+
+
+def _distance_key(squared: Float[Array, "..."]) -> Int[Array, "..."]:
+    """The same integers as `neighbors.distance_key`."""
+    if squared.dtype == jnp.float32:
+        return (jax.lax.bitcast_convert_type(squared, jnp.int32) + (1 << 7)) >> 8
+    return (jax.lax.bitcast_convert_type(squared, jnp.int64) + (1 << 21)) >> 22
+
+
+def _candidates(points, radius, on):
+    """Per point, start and length of the 3^d runs of `order` that hold its surroundings.
+
+    The grid is wrapped onto a torus with a few buckets per point. Wrapping adds candidates,
+    which their distance then rules out, and loses none; three or more buckets per axis keep
+    the 3^d cells around a point apart.
+    """
+    n, d = points.shape
+    wide = 1 << max(2, math.ceil(math.log2(4 * max(n, 1)) / d))
+    corner = jnp.min(jnp.where(on[:, None], points, jnp.inf), axis=0)
+    # Wrapped as floating-point numbers: far cells would overflow an int32.
+    cell = jnp.floor((jnp.where(on[:, None], points, corner) - corner) / (_MARGIN * radius))
+    cell = jnp.mod(cell, wide).astype(jnp.int32)
+    places = np.array([wide**a for a in range(d)], np.int32)
+    bucket = jnp.where(on, cell @ places, wide**d)
+    order = jnp.argsort(bucket).astype(jnp.int32)
+    first = jnp.searchsorted(bucket[order], jnp.arange(wide**d + 1)).astype(jnp.int32)
+    steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * d, indexing="ij"), axis=-1).reshape(-1, d)
+    around = jnp.mod(cell[:, None] + steps.astype(np.int32), wide) @ places
+    start = first[around]
+    length = jnp.where(on[:, None], first[around + 1] - start, 0)
+    return start, length, order

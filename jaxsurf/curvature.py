@@ -1,0 +1,173 @@
+r"""Curvature from the shape tensor $\nabla_S n$, the surface gradient of the normals.
+
+Signs: on the unit sphere with outward normals the principal curvatures are +1.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .cloud import PointCloud
+from .frames import tangent_frames
+from .neighbors import Neighbors
+from .operators import laplace_beltrami, surface_gradient
+from .stencils.dcpse import DCPSE
+from .stencils.method import AbstractMethod
+
+
+def shape_tensor(
+    cloud: PointCloud,
+    neighbors: Neighbors | None = None,
+    *,
+    method: AbstractMethod = DCPSE(order=2),
+) -> Float[Array, "n d d"]:
+    r"""Shape tensor $\nabla_S n$ in the coordinates of space (Singh et al. 2023, Section 4.3).
+
+    It is symmetric and maps normals to zero; the discrete one is made so.
+
+    Args:
+        cloud: n points in d dimensions with unit normals.
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        method: how derivatives are computed.
+
+    Returns:
+        One tensor per point, `(n, d, d)`, in units of 1 / length.
+
+    Accuracy: that of `surface_gradient` for exact normals (`tests/test_curvature.py`).
+    Differentiable: forward and reverse, in points and normals, for fixed neighbours.
+    Raises:
+        ValueError: as `surface_gradient`.
+    """
+    gradient = surface_gradient(cloud, neighbors, method=method)
+    tensor = gradient(cloud.normals)
+    n = cloud.normals
+    project = jnp.eye(cloud.dim, dtype=n.dtype) - n[:, :, None] * n[:, None]
+    tensor = jnp.einsum("nab,nbc,ncd->nad", project, tensor, project)
+    return (tensor + tensor.mT) / 2
+
+
+def mean_curvature(
+    cloud: PointCloud,
+    neighbors: Neighbors | None = None,
+    *,
+    method: AbstractMethod = DCPSE(order=2),
+) -> Float[Array, " n"]:
+    r"""Mean curvature $H = \tfrac{1}{d-1} \nabla_S\cdot n$: half the trace of the shape tensor.
+
+    For curves in the plane (d = 2) it is their curvature.
+
+    Args:
+        cloud: n points in d dimensions with unit normals.
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        method: how derivatives are computed.
+
+    Returns:
+        `(n,)`, in units of 1 / length; +1 on the unit sphere with outward normals.
+
+    Accuracy: that of `surface_gradient` for exact normals (`tests/test_curvature.py`).
+    Differentiable: forward and reverse, in points and normals, for fixed neighbours.
+    Raises:
+        ValueError: as `surface_gradient`.
+
+    Example:
+        >>> bool(jnp.abs(js.mean_curvature(js.sphere(2_000, radius=2.0)) - 0.5).max() < 0.01)
+        True
+    """
+    tensor = shape_tensor(cloud, neighbors, method=method)
+    return jnp.trace(tensor, axis1=1, axis2=2) / (cloud.dim - 1)
+
+
+def gauss_curvature(
+    cloud: PointCloud,
+    neighbors: Neighbors | None = None,
+    *,
+    method: AbstractMethod = DCPSE(order=2),
+) -> Float[Array, " n"]:
+    r"""Gauss curvature, the product of the principal curvatures.
+
+    Args:
+        cloud: n points in three dimensions with unit normals.
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        method: how derivatives are computed.
+
+    Returns:
+        `(n,)`, in units of 1 / length².
+
+    Accuracy: that of `surface_gradient` for exact normals (`tests/test_curvature.py`).
+    Differentiable: forward and reverse, in points and normals, for fixed neighbours.
+    Raises:
+        ValueError: as `surface_gradient`; a curve.
+    """
+    a = _in_tangent_plane(cloud, neighbors, method)[0]
+    return a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] ** 2
+
+
+def principal_curvatures(
+    cloud: PointCloud,
+    neighbors: Neighbors | None = None,
+    *,
+    method: AbstractMethod = DCPSE(order=2),
+) -> tuple[Float[Array, "n 2"], Float[Array, "n 2 3"]]:
+    r"""Principal curvatures and directions: eigenvalues and eigenvectors of the shape tensor.
+
+    Args:
+        cloud: n points in three dimensions with unit normals.
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        method: how derivatives are computed.
+
+    Returns:
+        The curvatures, smaller first, `(n, 2)`, and the unit directions, one per row,
+        `(n, 2, 3)`, with $t_1 \times t_2 = n$.
+
+    Accuracy: curvatures as `mean_curvature`; directions lose accuracy near umbilics, where
+    they are not defined.
+    Differentiable: away from umbilics (at equal curvatures the derivative is taken as that of
+    the mean curvature).
+    Raises:
+        ValueError: as `surface_gradient`; a curve.
+    """
+    a, tangents = _in_tangent_plane(cloud, neighbors, method)
+    mean, half = (a[:, 0, 0] + a[:, 1, 1]) / 2, (a[:, 0, 0] - a[:, 1, 1]) / 2
+    square = half**2 + a[:, 0, 1] ** 2
+    umbilic = square == 0
+    radius = jnp.where(umbilic, 0, jnp.sqrt(jnp.where(umbilic, 1, square)))
+    # Twice the angle from t1 to the direction of the larger curvature.
+    angle = jnp.arctan2(a[:, 0, 1], jnp.where(umbilic, 1, half)) / 2
+    c, s = jnp.cos(angle)[:, None], jnp.sin(angle)[:, None]
+    t1, t2 = tangents[:, 0], tangents[:, 1]
+    directions = jnp.stack([s * t1 - c * t2, c * t1 + s * t2], axis=1)
+    return jnp.stack([mean - radius, mean + radius], axis=1), directions
+
+
+def mean_curvature_vector(
+    cloud: PointCloud,
+    neighbors: Neighbors | None = None,
+    *,
+    method: AbstractMethod = DCPSE(order=2),
+) -> Float[Array, "n d"]:
+    r"""Mean curvature vector $\Delta_S x = -(d-1) H n$, the Laplacian of the positions.
+
+    Args:
+        cloud: n points in d dimensions with unit normals.
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        method: how derivatives are computed.
+
+    Returns:
+        `(n, d)`, in units of 1 / length; it points to the inside of a sphere.
+
+    Accuracy: that of `laplace_beltrami`.
+    Differentiable: forward and reverse, in points and normals, for fixed neighbours.
+    Raises:
+        ValueError: as `laplace_beltrami`.
+    """
+    return laplace_beltrami(cloud, neighbors, method=method)(cloud.points - cloud.points.mean(0))
+
+
+def _in_tangent_plane(cloud, neighbors, method):
+    """The shape tensor as a symmetric 2 x 2 matrix, and the tangents that it refers to."""
+    if cloud.dim != 3:
+        raise ValueError(f"a surface in 3 dimensions is needed, the cloud has {cloud.dim}")
+    tangents = tangent_frames(cloud.normals)[:, :2]
+    tensor = shape_tensor(cloud, neighbors, method=method)
+    return jnp.einsum("nap,npq,nbq->nab", tangents, tensor, tangents), tangents

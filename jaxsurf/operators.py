@@ -1,0 +1,441 @@
+r"""Differential operators on point clouds: on surfaces, and in flat space."""
+
+from __future__ import annotations
+
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .cloud import PointCloud, is_concrete
+from .neighbors import Neighbors, find_neighbors
+from .stencils.dcpse import DCPSE, FlatDCPSE
+from .stencils.method import AbstractMethod, Diagnostics, Neighborhood
+from .stencils.moments import blockwise
+from .stencils.stencil import Composition, Stencil
+from .stencils.targets import AbstractTarget, Gradient, Hessian, Laplacian, Partial
+
+
+def laplace_beltrami(
+    cloud: PointCloud,
+    neighbors: Neighbors | None = None,
+    *,
+    method: AbstractMethod = DCPSE(order=2),
+    throw: bool = True,
+) -> Stencil:
+    r"""Laplace–Beltrami operator of a point-cloud surface.
+
+    $(\Delta_S u)_i \approx \sum_j w_{ij}\,u_j$ with $\sum_j w_{ij} = 0$ (Singh et al. 2023,
+    eq. 11; Suchde and Kuhnert 2019, eqs. 25 to 27).
+
+    Args:
+        cloud: n points in d dimensions with unit normals.
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        method: how the weights are computed.
+        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`. Under `jit`,
+            `vmap` and `grad` nothing is raised: the diagnostics are the result code.
+
+    Returns:
+        Operator mapping `(n,)` or `(n, c)` fields to the same shape, in units of
+        field / length². Its eigenvalues have real parts ≤ 0.
+
+    Accuracy: error $O(h^r)$ for `DCPSE(order=r)`, $O(h^{p-1})$ for `GFDM(degree=p)`
+    (`tests/test_accuracy.py`).
+    Differentiable: forward and reverse, in points, normals and field, for fixed neighbours.
+    Raises:
+        ValueError: fewer neighbours than basis functions (both numbers given), or a stencil
+            whose conditions cannot be met (point, residual and count given).
+
+    Example:
+        >>> cloud = js.sphere(2_000)
+        >>> z = cloud.points[:, 2]
+        >>> bool(jnp.abs(js.laplace_beltrami(cloud)(z) + 2 * z).max() < 0.05)
+        True
+    """
+    return _build(cloud, neighbors, method, Laplacian(), throw)
+
+
+def surface_gradient(
+    cloud: PointCloud,
+    neighbors: Neighbors | None = None,
+    *,
+    method: AbstractMethod = DCPSE(order=2),
+    throw: bool = True,
+) -> Stencil:
+    r"""Gradient along the surface, $\nabla_S u$, as a vector in space.
+
+    (Singh et al. 2023, eqs. 9 and 11; Suchde and Kuhnert 2019, eqs. 16 to 21.)
+
+    Args:
+        cloud: n points in d dimensions with unit normals.
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        method: how the weights are computed.
+        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+
+    Returns:
+        Operator mapping `(n, *c)` fields to `(n, *c, d)`, in units of field / length.
+
+    Accuracy: error $O(h^r)$ for `DCPSE(order=r)`, $O(h^p)$ for `GFDM(degree=p)`.
+    Differentiable: forward and reverse, in points, normals and field, for fixed neighbours.
+    Raises:
+        ValueError: as `laplace_beltrami`.
+
+    Example:
+        >>> cloud = js.sphere(2_000)
+        >>> x, z = cloud.points, cloud.points[:, 2]
+        >>> exact = jnp.array([0.0, 0.0, 1.0]) - z[:, None] * x
+        >>> bool(jnp.abs(js.surface_gradient(cloud)(z) - exact).max() < 0.01)
+        True
+    """
+    return _build(cloud, neighbors, method, Gradient(), throw)
+
+
+def surface_divergence(
+    cloud: PointCloud,
+    neighbors: Neighbors | None = None,
+    *,
+    method: AbstractMethod = DCPSE(order=2),
+    throw: bool = True,
+) -> Stencil:
+    r"""Divergence along the surface, $\nabla_S \cdot v = \sum_a (\nabla_S v_a)_a$.
+
+    (Suchde and Kuhnert 2019, eq. 24.) A normal part of v contributes
+    $(\nabla_S\cdot n)\,v\cdot n$, as on a moving surface.
+
+    Args:
+        cloud: n points in d dimensions with unit normals.
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        method: how the weights are computed.
+        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+
+    Returns:
+        Operator mapping `(n, *c, d)` fields to `(n, *c)`, in units of field / length.
+
+    Accuracy: as `surface_gradient`.
+    Differentiable: forward and reverse, in points, normals and field, for fixed neighbours.
+    Raises:
+        ValueError: as `laplace_beltrami`.
+
+    Example:
+        >>> cloud = js.sphere(2_000, radius=2.0)
+        >>> bool(jnp.abs(js.surface_divergence(cloud)(cloud.normals) - 1).max() < 0.01)
+        True
+    """
+    gradient = _build(cloud, neighbors, method, Gradient(), throw)
+    return Stencil(gradient.indices, gradient.weights, (), (cloud.dim,), gradient.diagnostics)
+
+
+def directional_derivative(
+    cloud: PointCloud,
+    direction: Float[Array, "n d"],
+    *,
+    neighbors: Neighbors | None = None,
+    method: AbstractMethod = DCPSE(order=2),
+    throw: bool = True,
+) -> Stencil:
+    r"""Derivative $a \cdot \nabla_S u$ along a vector field a; its normal part does not count.
+
+    Args:
+        cloud: n points in d dimensions with unit normals.
+        direction: a, `(n, d)` or `(d,)`; its length scales the derivative.
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        method: how the weights are computed.
+        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+
+    Returns:
+        Operator mapping `(n, *c)` fields to the same shape.
+
+    Accuracy: as `surface_gradient`.
+    Differentiable: forward and reverse, in points, normals, direction and field.
+    Raises:
+        ValueError: as `laplace_beltrami`; a direction of the wrong shape.
+    """
+    gradient = _build(cloud, neighbors, method, Gradient(), throw)
+    direction = _field(direction, (cloud.n, cloud.dim), "direction")
+    weights = jnp.einsum("na,akn->kn", direction, gradient.weights)
+    return Stencil(gradient.indices, weights, diagnostics=gradient.diagnostics)
+
+
+def diffusion(
+    cloud: PointCloud,
+    diffusivity: Float[Array, "*n"],
+    *,
+    neighbors: Neighbors | None = None,
+    method: AbstractMethod = DCPSE(order=2),
+    throw: bool = True,
+) -> Stencil:
+    r"""Diffusion in an inhomogeneous or anisotropic medium, $\nabla_S\cdot(D\,\nabla_S u)$.
+
+    Written without derivatives of D: for a symmetric tensor,
+    $\partial_a(D_{ab}\,\partial_b u) = \tfrac12\left(D_{ab}\,\partial_a\partial_b u +
+    \partial_a\partial_b(D_{ab} u) - u\,\partial_a\partial_b D_{ab}\right)$, so that
+    $w_{ij} = \tfrac12 \sum_{ab} (D_{ab,i} + D_{ab,j})\, h_{ab,ij}$ for $j \ne i$ with h the
+    stencils of the second derivatives. For a scalar D these are the weights of the
+    Laplacian times the mean of D, which inherit their signs.
+
+    Args:
+        cloud: n points in d dimensions with unit normals.
+        diffusivity: D, scalar `(n,)` or symmetric tensor `(n, d, d)`; of a tensor only the
+            tangential part counts.
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        method: how the weights are computed.
+        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+
+    Returns:
+        Operator mapping `(n, *c)` fields to the same shape.
+
+    Accuracy: the order of the Laplace–Beltrami operator of the same method.
+    Differentiable: forward and reverse, in points, normals, diffusivity and field.
+    Raises:
+        ValueError: as `laplace_beltrami`; a diffusivity of the wrong shape.
+    """
+    d = jnp.asarray(diffusivity)
+    if d.shape == (cloud.n,):
+        stencil = _build(cloud, neighbors, method, Laplacian(), throw)
+        weights = stencil.weights * (d + d[stencil.indices]) / 2
+    elif d.shape == (cloud.n, cloud.dim, cloud.dim):
+        stencil = _build(cloud, neighbors, method, Hessian(), throw)
+        project = jnp.eye(cloud.dim) - cloud.normals[:, :, None] * cloud.normals[:, None]
+        d = jnp.einsum("nab,nbc,ncd->nad", project, (d + d.mT) / 2, project)
+        mean = (d + d[stencil.indices]) / 2
+        weights = jnp.einsum("knab,abkn->kn", mean, stencil.weights)
+    else:
+        shapes = f"({cloud.n},) or ({cloud.n}, {cloud.dim}, {cloud.dim})"
+        raise ValueError(f"diffusivity has shape {d.shape}, expected {shapes}")
+    weights = weights.at[0].set(-jnp.sum(weights[1:], axis=0))
+    return Stencil(stencil.indices, weights, diagnostics=stencil.diagnostics)
+
+
+def biharmonic(
+    cloud: PointCloud,
+    neighbors: Neighbors | None = None,
+    *,
+    method: AbstractMethod = DCPSE(order=4),
+    throw: bool = True,
+) -> Composition:
+    r"""Bi-Laplacian $\Delta_S^2$, the Laplace–Beltrami operator applied twice.
+
+    Args:
+        cloud: n points in d dimensions with unit normals.
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        method: how the weights are computed.
+        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+
+    Returns:
+        Operator mapping `(n, *c)` fields to the same shape, in units of field / length⁴.
+
+    Accuracy: on scattered points two orders below the Laplacian's, as the error of the inner
+    operator is differentiated twice; hence the higher default.
+    Differentiable: forward and reverse, in points, normals and field.
+    Raises:
+        ValueError: as `laplace_beltrami`.
+    """
+    laplacian = laplace_beltrami(cloud, neighbors, method=method, throw=throw)
+    return laplacian @ laplacian
+
+
+def partial_derivative(
+    points: Float[Array, "n d"],
+    alpha: tuple[int, ...],
+    *,
+    neighbors: Neighbors | None = None,
+    method: FlatDCPSE = FlatDCPSE(order=2),
+    throw: bool = True,
+) -> Stencil:
+    r"""A derivative $D^\alpha$ on scattered points of the plane or of space, by flat DC-PSE.
+
+    (Singh et al. 2023, Section 2: eqs. 4 to 8.)
+
+    Args:
+        points: `(n, d)` with d = 2 or 3.
+        alpha: how often to differentiate along each axis, for example `(2, 0)`.
+        neighbors: from `find_neighbors`; the nearest ones that the method asks for if None.
+        method: how the weights are computed.
+        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+
+    Returns:
+        Operator mapping `(n, *c)` fields to the same shape, in units of
+        field / length^|alpha|.
+
+    Accuracy: error $O(h^r)$ in the interior and at borders (`tests/test_flat.py`).
+    Differentiable: forward and reverse, in points and field, for fixed neighbours.
+    Raises:
+        ValueError: as `laplace_beltrami`; an alpha that is no multi-index of length d ≥ 1.
+
+    Example:
+        >>> x, y = jnp.meshgrid(jnp.linspace(0, 1, 20), jnp.linspace(0, 1, 20))
+        >>> points = jnp.stack([x.ravel(), y.ravel()], axis=1)
+        >>> d_xy = js.partial_derivative(points, (1, 1))
+        >>> bool(jnp.allclose(d_xy(points[:, 0] * points[:, 1]), 1))
+        True
+    """
+    points = jnp.asarray(points)
+    dim = points.shape[-1]
+    if len(alpha) != dim or min(alpha) < 0 or sum(alpha) < 1:
+        raise ValueError(f"alpha = {alpha} is no derivative in {dim} dimensions")
+    # In flat space all directions are alike; the constant normals only serve the search.
+    normals = jnp.zeros_like(points).at[:, -1].set(1)
+    cloud = PointCloud(points, normals)
+    target = Partial(tuple(alpha))
+    if neighbors is None:
+        neighbors = find_neighbors(cloud, min(method.neighbor_count(dim, target), len(points)), throw=False)
+    return _build(cloud, neighbors, method, target, throw)
+
+
+# --- building ------------------------------------------------------------------------------
+
+# A stencil is adapted if the weight of its centre is less than this share of all the others.
+_DOMINANCE = 0.2
+# Growth of the neighbourhoods of such points, tried in turn.
+_GROWTH = (1.5, 2.25, 3.4)
+
+
+def choose_neighbors(
+    cloud: PointCloud, *, method: AbstractMethod = DCPSE(order=2), throw: bool = True
+) -> Neighbors:
+    r"""Neighbourhoods suited to a method, larger where the points are irregular.
+
+    Every point gets the number of neighbours that the method asks for. Where the
+    Laplacian's weight of the centre is then positive or small,
+    $-w_{ii} < 0.2 \sum_{j \ne i} |w_{ij}|$, or its conditions cannot be met, the neighbourhood
+    grows by half, up to three times. Such points are what gives collocation matrices
+    eigenvalues with positive real part (`experiments`, stability study).
+
+    Args:
+        cloud: n points in d dimensions with unit normals; concrete.
+        method: how the weights will be computed.
+        throw: passed on to `find_neighbors`.
+
+    Returns:
+        Neighbour lists; rows that did not grow are padded.
+    """
+    return _adapted(cloud, method, throw)[0]
+
+
+def _build(cloud, neighbors, method, target, throw) -> Stencil:
+    weights = None
+    if neighbors is None:
+        neighbors, laplacian = _adapted(cloud, method, throw)
+        if isinstance(target, Laplacian):
+            weights = laplacian
+    _check_sizes(cloud, neighbors, method, target)
+    if weights is None:
+        weights = _weights(cloud, neighbors, method, target)
+    values, diagnostics = weights
+    components = values.shape[:-2]
+    stencil = Stencil(neighbors.indices.T, values, components, (), diagnostics)
+    if throw and is_concrete(values):
+        _check(stencil, neighbors, method, target, cloud.dim)
+    return stencil
+
+
+@eqx.filter_jit
+def _weights(cloud, neighbors, method, target, rows=None):
+    """Weights `(*components, k, n)` and diagnostics of all stencils, or of some rows."""
+    rows = jnp.arange(cloud.n) if rows is None else rows
+    index = neighbors.indices[rows]
+    radius = neighbors.radius
+    if radius is not None:
+        radius = jnp.broadcast_to(radius, (cloud.n,))[rows]
+    around = Neighborhood(
+        cloud.points[index] - cloud.points[rows][:, None],
+        cloud.normals[index],
+        neighbors.mask[rows],
+        radius,
+    )
+    weights, diagnostics = blockwise(
+        lambda one: method.weights(one, target), method.batch_size, around
+    )
+    return jnp.moveaxis(weights, 0, -1), diagnostics
+
+
+def _adapted(cloud, method, throw) -> tuple[Neighbors, tuple | None]:
+    """Neighbours that suit the method, and the Laplacian's weights unless some rows grew."""
+    if not is_concrete(*jax.tree.leaves(cloud)):
+        raise ValueError("neighbors=None needs concrete arrays; under jit pass the neighbours")
+    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    k = min(method.neighbor_count(cloud.dim), int(on.sum()))
+    neighbors = find_neighbors(cloud, k, throw=throw)
+    _check_sizes(cloud, neighbors, method, Laplacian())
+    weights = _weights(cloud, neighbors, method, Laplacian())
+    poor = on & _is_poor(*weights)
+    if not poor.any():
+        return neighbors, weights
+    for growth in _GROWTH:
+        wider = find_neighbors(cloud, min(int(k * growth), int(on.sum())), throw=False)
+        neighbors = _with_rows(neighbors, wider, poor)
+        # The rows to be tried again, filled up so that few shapes are ever compiled.
+        rows = np.flatnonzero(poor)
+        filled = np.resize(rows, 1 << int(np.ceil(np.log2(max(rows.size, 256)))))
+        again = _is_poor(*_weights(cloud, wider, method, Laplacian(), jnp.asarray(filled)))
+        poor[rows] = again[: rows.size]
+        if not poor.any():
+            break
+    return neighbors, None
+
+
+def _is_poor(weights, diagnostics) -> np.ndarray:
+    weights, residual = np.asarray(weights), np.asarray(diagnostics.residual)
+    others = np.sum(np.abs(weights[1:]), axis=0)
+    return ~((-weights[0] >= _DOMINANCE * others) & (residual < _tolerance(weights.dtype)))
+
+
+def _with_rows(neighbors: Neighbors, wider: Neighbors, rows: np.ndarray) -> Neighbors:
+    extra = wider.k - neighbors.k
+    own = jnp.broadcast_to(jnp.arange(neighbors.n, dtype=jnp.int32)[:, None], (neighbors.n, extra))
+    indices = jnp.concatenate([neighbors.indices, own], axis=1)
+    mask = jnp.pad(neighbors.mask, ((0, 0), (0, extra)))
+    take = jnp.asarray(rows)[:, None]
+    return Neighbors(
+        jnp.where(take, wider.indices, indices), jnp.where(take, wider.mask, mask), None
+    )
+
+
+# --- checks --------------------------------------------------------------------------------
+
+
+def _tolerance(dtype) -> float:
+    """Largest relative moment residual of a stencil that counts as determined."""
+    return float(np.finfo(dtype).eps) ** 0.5
+
+
+def _check_sizes(cloud, neighbors, method, target) -> None:
+    if neighbors.n != cloud.n:
+        raise ValueError(f"neighbours of {neighbors.n} points, the cloud has {cloud.n}")
+    need = method.basis_size(cloud.dim, target)
+    if neighbors.k < need:
+        raise ValueError(f"k = {neighbors.k} neighbours, {method} needs at least {need}")
+
+
+def _check(stencil: Stencil, neighbors, method, target, dim) -> None:
+    diagnostics: Diagnostics = stencil.diagnostics
+    on = np.asarray(neighbors.mask[:, 0])
+    count, residual = np.asarray(diagnostics.count), np.asarray(diagnostics.residual)
+    bad = np.flatnonzero(on & ~(residual < _tolerance(residual.dtype)))
+    if bad.size:
+        i = bad[0]
+        raise ValueError(
+            f"degenerate stencil at point {i}: relative moment residual {residual[i]:.1e} with "
+            f"{count[i]} points within the support {float(diagnostics.support[i]):.3g}, {method} "
+            f"needs at least {method.basis_size(dim, target)} in general position "
+            f"({bad.size} such points)"
+        )
+    tube = np.where(on, np.asarray(diagnostics.tube), 0)
+    if tube.max(initial=0) > 1:
+        i = int(tube.argmax())
+        warnings.warn(
+            f"the surface bends within one stencil: support x curvature = {tube[i]:.2f} at point "
+            f"{i} ({int(np.sum(tube > 1))} points above 1). Use more points there or a smaller "
+            "support",
+            stacklevel=4,
+        )
+
+
+def _field(values, shape: tuple[int, ...], name: str):
+    values = jnp.asarray(values)
+    if values.shape not in (shape, shape[1:]):
+        raise ValueError(f"{name} has shape {values.shape}, expected {shape}")
+    return jnp.broadcast_to(values, shape)

@@ -1,0 +1,87 @@
+"""What every kind of stencil offers, and what is known of each stencil afterwards."""
+
+from __future__ import annotations
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .targets import AbstractTarget
+
+
+class Neighborhood(eqx.Module):
+    """What one stencil sees: offsets and normals of the neighbours, centre first."""
+
+    offsets: Float[Array, "k d"]
+    normals: Float[Array, "k d"]
+    mask: Bool[Array, " k"]
+    radius: Float[Array, ""] | None
+
+
+class Diagnostics(eqx.Module):
+    """Per point, how well its stencil is determined.
+
+    Args:
+        condition: condition number of the equilibrated moment matrix (an estimate from below).
+        residual: largest error of a moment condition, relative to the moments wanted.
+        count: neighbours within the support, the point itself included.
+        support: support radius, in the units of the points.
+        layers: normal copies used on either side; 0 for methods without.
+        tube: support radius times the largest normal curvature seen within it. Above 1 the
+            tube of that radius around the surface intersects itself: copies along the normals
+            cross, and the surface is no graph over the tangent plane.
+    """
+
+    condition: Float[Array, "*n"]
+    residual: Float[Array, "*n"]
+    count: Int[Array, "*n"]
+    support: Float[Array, "*n"]
+    layers: Int[Array, "*n"]
+    tube: Float[Array, "*n"]
+
+    @classmethod
+    def of(cls, around: Neighborhood, condition, residual, support, layers: int) -> Diagnostics:
+        """Diagnostics of one stencil: what the solve tells, and what its geometry does."""
+        r2 = jnp.sum(around.offsets**2, axis=1)
+        inside = around.mask & (r2 < support**2)
+        turn = jnp.sum(around.offsets * (around.normals - around.normals[0]), axis=1)
+        bend = jnp.where(inside & (r2 > 0), jnp.abs(turn) / jnp.where(r2 > 0, r2, 1), 0)
+        values = (condition, residual, jnp.sum(inside), support)
+        return jax.tree.map(
+            jax.lax.stop_gradient,
+            cls(*values, jnp.asarray(layers), jnp.max(bend) * support),
+        )
+
+
+class AbstractMethod(eqx.Module):
+    """A way to compute the weights of stencils."""
+
+    @abc.abstractmethod
+    def neighbor_count(self, dim: int) -> int:
+        """How many neighbours (the point itself counts) to look for in d-dimensional space."""
+
+    @abc.abstractmethod
+    def basis_size(self, dim: int, target: AbstractTarget) -> int:
+        """Polynomials along the surface that a stencil is exact on: the points it needs."""
+
+    @abc.abstractmethod
+    def weights(
+        self, neighborhood: Neighborhood, target: AbstractTarget
+    ) -> tuple[Float[Array, "... k"], Diagnostics]:
+        """Weights of one stencil, `(*components, k)`, in units of length to the minus order."""
+
+    @property
+    @abc.abstractmethod
+    def batch_size(self) -> int:
+        """How many stencils are computed at once: enough to be fast, few enough for the cache."""
+
+
+def check_positive(method: AbstractMethod, *names: str) -> None:
+    """Raise unless each of these settings is a positive number, or None."""
+    for name in names:
+        value = getattr(method, name)
+        if value is not None and not value > 0:
+            raise ValueError(f"{type(method).__name__}: {name} = {value}, expected a positive number")

@@ -1,0 +1,73 @@
+r"""Multi-indices and monomials $x^\gamma = x_1^{\gamma_1} \cdots x_d^{\gamma_d}$.
+
+Every basis here is *graded*: all multi-indices of length d, by increasing degree $|\gamma|$.
+Multi-indices are plain NumPy arrays, known at compile time; only the coordinates are traced.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+@functools.cache
+def multi_indices(dim: int, low: int, high: int) -> np.ndarray:
+    """All multi-indices with `low <= degree <= high`, graded, shape `(m, dim)`."""
+    graded = [
+        gamma
+        for degree in range(low, high + 1)
+        for gamma in itertools.product(range(degree, -1, -1), repeat=dim)
+        if sum(gamma) == degree
+    ]
+    return np.array(graded, int).reshape(-1, dim)
+
+
+@functools.cache
+def position(dim: int, high: int) -> dict[tuple[int, ...], int]:
+    """Where each multi-index stands in `multi_indices(dim, 0, high)`."""
+    return {tuple(gamma): i for i, gamma in enumerate(multi_indices(dim, 0, high).tolist())}
+
+
+@functools.cache
+def _parents(dim: int, high: int) -> tuple[tuple[int, int], ...]:
+    """For each multi-index but the first: a lower one, and the coordinate that leads to it."""
+    place, parents = position(dim, high), []
+    for gamma in list(place)[1:]:
+        axis = next(a for a in range(dim) if gamma[a])
+        lower = gamma[:axis] + (gamma[axis] - 1,) + gamma[axis + 1 :]
+        parents.append((place[lower], axis))
+    return tuple(parents)
+
+
+def monomials(x: Float[Array, "dim q"], high: int) -> Float[Array, "m q"]:
+    """All monomials of degree 0 to `high`, one multiplication each."""
+    rows = [jnp.ones_like(x[0])]
+    for lower, axis in _parents(x.shape[0], high):
+        rows.append(rows[lower] * x[axis])
+    return jnp.stack(rows)
+
+
+@functools.cache
+def differentiation(dim: int, high: int) -> np.ndarray:
+    r"""Matrices $D_a$, `(dim, m, m)`: coefficients of $\partial_a$ of a polynomial from its own."""
+    place = position(dim, high)
+    matrices = np.zeros((dim, len(place), len(place)))
+    for gamma, column in place.items():
+        for axis in range(dim):
+            if gamma[axis]:
+                lower = gamma[:axis] + (gamma[axis] - 1,) + gamma[axis + 1 :]
+                matrices[axis, place[lower], column] = gamma[axis]
+    return matrices
+
+
+def derivative_at_origin(dim: int, high: int, alpha: tuple[int, ...]) -> np.ndarray:
+    r"""$D^\alpha x^\gamma$ at 0 for every monomial: $\alpha!$ where $\gamma = \alpha$, else 0."""
+    place = position(dim, high)
+    values = np.zeros(len(place))
+    values[place[alpha]] = math.prod(math.factorial(a) for a in alpha)
+    return values

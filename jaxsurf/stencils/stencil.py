@@ -1,0 +1,231 @@
+"""Linear operators on fields: stencils and their compositions."""
+
+from __future__ import annotations
+
+import abc
+import math
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import scipy.sparse
+from jaxtyping import Array, Float, Int
+
+from .method import Diagnostics
+
+
+class AbstractOperator(eqx.Module):
+    """A linear map from fields `(n, *batch, *in_shape)` to fields `(n, *batch, *out_shape)`."""
+
+    @property
+    @abc.abstractmethod
+    def n(self) -> int:
+        """Number of points."""
+
+    @property
+    @abc.abstractmethod
+    def in_shape(self) -> tuple[int, ...]:
+        """Components per point that the operator takes: `()` for scalar fields."""
+
+    @property
+    @abc.abstractmethod
+    def out_shape(self) -> tuple[int, ...]:
+        """Components per point that the operator gives."""
+
+    @abc.abstractmethod
+    def __call__(self, u: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
+        """Apply to a field or to a batch of fields."""
+
+    @abc.abstractmethod
+    def transpose(self) -> AbstractOperator:
+        """The transposed operator, with the components taken and given exchanged."""
+
+    @abc.abstractmethod
+    def to_scipy(self) -> scipy.sparse.csr_matrix:
+        """CSR matrix acting on flattened fields (the components of a point stand together)."""
+
+    def __matmul__(self, other: AbstractOperator) -> Composition:
+        return Composition(self, other)
+
+    def to_lineax(self, dtype=None) -> lx.FunctionLinearOperator:
+        """The operator on one field, for the linear solvers of lineax."""
+        dtype = jnp.result_type(float) if dtype is None else dtype
+        field = jax.ShapeDtypeStruct((self.n, *self.in_shape), dtype)
+        return lx.FunctionLinearOperator(self, field)
+
+
+class Stencil(AbstractOperator):
+    r"""A sparse operator with the same number k of neighbours at every point.
+
+    $(L u)_i = \sum_{s} w_{si}\, u_{j(s, i)}$. The neighbour slots run along the first axis, so
+    that one pass adds one slot for all points, reading contiguous columns.
+
+    Args:
+        indices: neighbour of point i in slot s, `(k, n)`.
+        weights: `(*out_shape, *in_shape, k, n)`; zero in padded slots.
+        out_shape: `()` for scalar results, `(d,)` for a gradient.
+        in_shape: `()` for scalar fields, `(d,)` for a divergence.
+        diagnostics: how well each stencil is determined; None if unknown.
+
+    Differentiable: forward and reverse, in the weights and in the field.
+    """
+
+    indices: Int[Array, "k n"]
+    weights: Float[Array, "*c k n"]
+    out_shape: tuple[int, ...] = eqx.field(static=True, default=())
+    in_shape: tuple[int, ...] = eqx.field(static=True, default=())
+    diagnostics: Diagnostics | None = None
+
+    def __check_init__(self):
+        shape = (*self.out_shape, *self.in_shape, *self.indices.shape)
+        if self.weights.shape != shape:
+            raise ValueError(f"weights have shape {self.weights.shape}, expected {shape}")
+
+    @property
+    def n(self) -> int:
+        return self.indices.shape[1]
+
+    @property
+    def k(self) -> int:
+        """Number of slots, the centre included."""
+        return self.indices.shape[0]
+
+    def __call__(self, u):
+        u = jnp.asarray(u)
+        q, p = math.prod(self.in_shape), math.prod(self.out_shape)
+        split = u.ndim - len(self.in_shape)
+        if split < 1 or u.shape[0] != self.n or u.shape[split:] != self.in_shape:
+            raise ValueError(
+                f"field has shape {u.shape}, expected ({self.n}, ..., {self.in_shape})"
+            )
+        batch = u.shape[1:split]
+        columns = jnp.moveaxis(u.reshape(self.n, -1, q), 0, -1)
+        weights = jnp.moveaxis(self.weights.reshape(p, q, self.k, self.n), 2, 0)
+        dtype = jnp.result_type(u, weights)
+
+        def add_slot(total, slot):
+            w, j = slot
+            neighbor = columns.at[:, :, j].get(mode="promise_in_bounds")
+            return total + jnp.sum(w * neighbor[:, None], axis=2), None
+
+        zero = jnp.zeros((columns.shape[0], p, self.n), dtype)
+        total, _ = jax.lax.scan(add_slot, zero, (weights, self.indices))
+        return jnp.moveaxis(total, -1, 0).reshape(self.n, *batch, *self.out_shape)
+
+    def transpose(self) -> Stencil:
+        """The transposed stencil, again with one gather per slot.
+
+        The indices must be concrete (they decide the number of slots, the largest number of
+        stencils that any point is part of); the weights may be traced.
+        """
+        slots, order = _incoming(np.asarray(self.indices))
+        source = np.broadcast_to(np.arange(self.n), self.indices.shape).ravel()[order]
+        flat = self.weights.reshape(*self.out_shape, *self.in_shape, -1)[..., order]
+        place, row = slots
+        k = int(place.max()) + 1
+        indices = np.broadcast_to(np.arange(self.n, dtype=np.int32), (k, self.n)).copy()
+        indices[place, row] = source
+        moved = jnp.zeros((*self.weights.shape[:-2], k, self.n), self.weights.dtype)
+        moved = moved.at[..., place, row].set(flat)
+        if self.out_shape and self.in_shape:
+            moved = jnp.moveaxis(moved, 0, 1)
+        return Stencil(jnp.asarray(indices), moved, self.in_shape, self.out_shape)
+
+    def to_scipy(self):
+        p, q, n = math.prod(self.out_shape), math.prod(self.in_shape), self.n
+        weights = np.asarray(self.weights).reshape(p, q, self.k, n)
+        columns = np.asarray(self.indices)
+        rows = np.broadcast_to(np.arange(n), columns.shape)
+        a, b = np.arange(p)[:, None, None, None], np.arange(q)[:, None, None]
+        i = np.broadcast_to(rows * p + a, weights.shape)
+        j = np.broadcast_to(columns * q + b, weights.shape)
+        data = (weights.ravel(), (i.ravel(), j.ravel()))
+        matrix = scipy.sparse.csr_matrix(data, shape=(n * p, n * q))  # adds padded zeros up
+        matrix.eliminate_zeros()
+        return matrix
+
+    def scaled(self, factor: Float[Array, " n"] | float) -> Stencil:
+        """The operator with row i multiplied by `factor[i]`."""
+        return eqx.tree_at(lambda s: s.weights, self, self.weights * factor)
+
+    def save(self, path: str | Path) -> None:
+        """Write indices and weights to a NumPy archive (`.npz`, no pickle)."""
+        extra = {} if self.diagnostics is None else _arrays(self.diagnostics)
+        with open(path, "wb") as file:
+            np.savez(
+                file,
+                indices=np.asarray(self.indices),
+                weights=np.asarray(self.weights),
+                out_shape=np.array(self.out_shape, int),
+                in_shape=np.array(self.in_shape, int),
+                **extra,
+            )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Stencil:
+        """Read what `save` wrote.
+
+        Raises:
+            ValueError: the file is not such an archive.
+        """
+        try:
+            archive = np.load(path, allow_pickle=False)
+            data = {name: archive[name] for name in archive.files}
+            shapes = [tuple(data.pop(name).tolist()) for name in ("out_shape", "in_shape")]
+            indices, weights = jnp.asarray(data.pop("indices")), jnp.asarray(data.pop("weights"))
+        except (OSError, EOFError, KeyError, ValueError, AttributeError) as error:
+            raise ValueError(f"{path} does not hold a stencil: {error}") from error
+        extra = {name: jnp.asarray(value) for name, value in data.items()}
+        return cls(indices, weights, *shapes, Diagnostics(**extra) if extra else None)
+
+
+class Composition(AbstractOperator):
+    """One operator after another: `(outer @ inner)(u) = outer(inner(u))`."""
+
+    outer: AbstractOperator
+    inner: AbstractOperator
+
+    def __check_init__(self):
+        have = (self.inner.n, self.inner.out_shape)
+        want = (self.outer.n, self.outer.in_shape)
+        if have != want:
+            raise ValueError(f"inner operator gives (n, components) {have}, outer takes {want}")
+
+    @property
+    def n(self):
+        return self.inner.n
+
+    @property
+    def in_shape(self):
+        return self.inner.in_shape
+
+    @property
+    def out_shape(self):
+        return self.outer.out_shape
+
+    def __call__(self, u):
+        return self.outer(self.inner(u))
+
+    def transpose(self):
+        return Composition(self.inner.transpose(), self.outer.transpose())
+
+    def to_scipy(self):
+        return self.outer.to_scipy() @ self.inner.to_scipy()
+
+
+def _arrays(module: eqx.Module) -> dict[str, np.ndarray]:
+    return {name: np.asarray(value) for name, value in vars(module).items()}
+
+
+def _incoming(indices: np.ndarray):
+    """For every entry, sorted by the point it reads: its slot and row in the transpose."""
+    target = indices.ravel()
+    order = np.argsort(target, kind="stable")
+    row = target[order]
+    counts = np.bincount(row, minlength=indices.shape[1])
+    start = np.cumsum(counts) - counts
+    place = np.arange(row.size) - start[row]
+    return (place, row), order

@@ -208,7 +208,11 @@ class EdgeTable:
 
 
 def clean_mesh(
-    vertices: Float[Array, "n 3"], triangles: Int[Array, "m 3"], *, name: str = "mesh"
+    vertices: Float[Array, "n 3"],
+    triangles: Int[Array, "m 3"],
+    *,
+    name: str = "mesh",
+    stacklevel: int = 2,
 ) -> tuple[TriangleMesh, Int[Array, " kept"]]:
     """Mesh from raw arrays, every repair stated in a warning.
 
@@ -220,6 +224,7 @@ def clean_mesh(
         vertices: positions, `(n, 3)`.
         triangles: vertex numbers from 0, `(m, 3)`.
         name: what to call the mesh in warnings and errors.
+        stacklevel: of the warnings, as in `warnings.warn`.
 
     Returns:
         The mesh, and for each of its vertices the row of `vertices` that it was.
@@ -231,7 +236,7 @@ def clean_mesh(
     triangles = np.asarray(triangles, np.int64)
     try:
         _check_arrays(vertices, triangles)
-        first, inverse = _merge_equal(vertices)
+        first, inverse = merge_equal(vertices)
         merged = len(vertices) - len(first)
         triangles = inverse[triangles]
         a, b, c = triangles.T
@@ -256,7 +261,7 @@ def clean_mesh(
         (flip.sum(), "{} triangles turned round to agree with their neighbours"),
     ):
         if count:
-            warnings.warn(f"{name}: " + text.format(count), stacklevel=3)
+            warnings.warn(f"{name}: " + text.format(count), stacklevel=stacklevel)
     return mesh, kept
 
 
@@ -413,7 +418,7 @@ def _check_manifold(table: EdgeTable):
         )
 
 
-def _merge_equal(points: Float[Array, "n d"]) -> tuple[Int[Array, " u"], Int[Array, " n"]]:
+def merge_equal(points: Float[Array, "n d"]) -> tuple[Int[Array, " u"], Int[Array, " n"]]:
     """First row of every distinct point, in order of appearance, and each row's place there."""
     order = np.lexsort(points.T)  # stable, so equal rows stay in order of appearance
     new = np.ones(len(points), bool)

@@ -1,0 +1,303 @@
+"""Point clouds from files, and files for ParaView from point clouds and fields."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsurf.cloud import PointCloud, raise_at
+from jaxsurf.formats import Contents, contents_of, meshio
+from jaxsurf.frames import estimate_normals
+from jaxsurf.shapes.closest import fit_surface
+from jaxsurf.shapes.meshes import TriangleMesh, clean_mesh, merge_equal, sample_mesh
+
+# What a cloud carries besides points and normals goes into files under these names.
+_OWN = ("boundary", "active", "spacing")
+
+
+def read(
+    path: str | Path,
+    *,
+    n: int | None = None,
+    spacing: float | None = None,
+    smooth: bool = True,
+    degree: int = 4,
+    seed: int = 0,
+) -> PointCloud:
+    """Point cloud from a triangle mesh or a list of points.
+
+    OBJ, OFF and XYZ (columns `x y z` or `x y z nx ny nz`; `x y` or `x y nx ny` for curves in the
+    plane) need no other package; PLY, STL, VTK and VTU need `pip install 'jaxsurf[files]'`.
+
+    Normals are those in the file, scaled to length one. A mesh without them gives the side they
+    point to by the order of its corners, and their direction comes from local polynomial fits
+    of its vertices (`smooth=True`) or from the triangles around (first-order accurate). A list
+    of points without normals gets those of `estimate_normals`.
+
+    Stated in a warning, with how many: polygons cut into triangles that share their first
+    corner, vertices at equal positions merged (always so in STL), vertices that no triangle
+    uses and triangles without area left out, triangles turned round to agree with the others.
+
+    Args:
+        path: file; its suffix tells the format.
+        n: resample a mesh to this many points, see `sample_mesh`.
+        spacing: resample a mesh to this distance between neighbours instead.
+        smooth: the mesh stands for a smooth surface: fit polynomials. False keeps to the
+            triangles, right for sharp edges.
+        degree: of the polynomials; that of the operators to be used.
+        seed: of resampling.
+
+    Returns:
+        The vertices in the order of the file (`sort_cloud` sorts them), with `boundary` at the
+        border of an open mesh; if resampled, new points in sorted order.
+
+    Accuracy: normals of a smooth surface O(h^degree) (`tests/test_io.py::test_mesh_normals`).
+    Raises:
+        OSError: no such file.
+        ValueError: the file is empty, truncated, of unknown kind or has no points; vertex
+            numbers out of range, non-finite coordinates, zero normals, coinciding points of a
+            cloud (named by index); edges of more than two triangles; a surface with one side
+            only; too few points. The message begins with the path.
+        ImportError: meshio is needed and absent.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> path = pathlib.Path(folder.name) / "sphere.xyz"
+        >>> js.write(path, js.sphere(500))
+        >>> js.read(path).points.shape
+        (500, 3)
+    """
+    contents = contents_of(path)
+    notes = list(contents.notes)
+    triangles = _triangulate(contents, notes)
+    for note in notes:
+        warnings.warn(f"{path}: {note}", stacklevel=2)
+    try:
+        if not len(triangles):
+            return _from_points(contents, n, spacing, degree)
+        vertices = contents.points
+        mesh, kept = clean_mesh(vertices, triangles, name=str(path), stacklevel=3)
+    except ValueError as error:
+        raise ValueError(_prefixed(path, error)) from None
+    if n is not None or spacing is not None:
+        return sample_mesh(mesh, n=n, spacing=spacing, smooth=smooth, degree=degree, seed=seed)
+    normals = None
+    if contents.normals is not None:
+        first, group = merge_equal(contents.points)
+        total = np.zeros((len(first), 3))
+        np.add.at(total, group, contents.normals)
+        try:
+            normals = _unit(total[group[kept]])
+        except ValueError as error:
+            raise ValueError(_prefixed(path, error)) from None
+    elif smooth:
+        normals = _fitted_normals(path, mesh, degree)
+    else:
+        normals = mesh.vertex_normals
+    boundary = None if mesh.closed else jnp.asarray(mesh.border_vertices)
+    return PointCloud(jnp.asarray(mesh.vertices), jnp.asarray(normals), boundary=boundary)
+
+
+def _triangulate(contents: Contents, notes: list[str]) -> np.ndarray:
+    parts, cut = [np.empty((0, 3), np.int64)], 0
+    for polygons in contents.faces:
+        corners = polygons.shape[1]
+        cut += len(polygons) if corners > 3 else 0
+        first = np.repeat(polygons[:, :1], corners - 2, axis=1)
+        fan = np.stack([first, polygons[:, 1:-1], polygons[:, 2:]], axis=-1)
+        parts.append(fan.reshape(-1, 3))
+    if cut:
+        notes.append(f"{cut} polygons with more than three corners cut into triangles")
+    return np.concatenate(parts)
+
+
+def _from_points(contents: Contents, n, spacing, degree: int) -> PointCloud:
+    if n is not None or spacing is not None:
+        raise ValueError("a list of points without triangles cannot be resampled")
+    points, normals = contents.points, contents.normals
+    raise_at(~np.isfinite(points).all(axis=1), "point {i} is not finite: {v}", points)
+    first, group = merge_equal(points)
+    again = np.flatnonzero(first[group] != np.arange(len(points)))
+    if again.size:
+        i = again[0]
+        raise ValueError(f"points {first[group[i]]} and {i} coincide ({again.size} such points)")
+    if normals is not None:
+        normals = _unit(normals)
+        # Plane curves are kept in space by formats that know nothing else.
+        if points.shape[1] == 3 and not points[:, 2].any() and not normals[:, 2].any():
+            points, normals = points[:, :2], normals[:, :2]
+    own = {k: jnp.asarray(contents.fields[k]) for k in _OWN if k in contents.fields}
+    x = jnp.asarray(points)
+    if normals is None:
+        return PointCloud(x, estimate_normals(x, degree=degree), **own)
+    return PointCloud(x, jnp.asarray(normals), **own)
+
+
+def _unit(normals: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(normals, axis=1)
+    bad = ~(np.isfinite(length) & (length > 0))
+    raise_at(bad, "normal {i} is {v}, expected a direction", normals)
+    return normals / length[:, None]
+
+
+def _fitted_normals(path, mesh: TriangleMesh, degree: int) -> np.ndarray:
+    need = math.comb(degree + 2, 2) + 2
+    if len(mesh.vertices) < need:
+        raise ValueError(
+            f"{path}: {len(mesh.vertices)} vertices, normals of degree {degree} need at least"
+            f" {need}: lower the degree or take smooth=False"
+        )
+    _, normals, used = fit_surface(
+        mesh.vertices,
+        mesh.vertex_normals,
+        vertices=mesh.vertices,
+        vertex_normals=mesh.vertex_normals,
+        degree=degree,
+    )
+    low = np.count_nonzero(used < degree)
+    if low:
+        warnings.warn(
+            f"{path}: the neighbours of {low} of {len(used)} vertices allow no fit of degree"
+            f" {degree}; the lowest degree used for a normal is {used.min()}",
+            stacklevel=3,
+        )
+    return normals
+
+
+def _prefixed(path, error: Exception) -> str:
+    text = str(error)
+    return text if text.startswith(str(path)) else f"{path}: {text}"
+
+
+def read_fields(path: str | Path) -> dict[str, np.ndarray]:
+    """Values per point in a PLY, VTK or VTU file, in the order of its points.
+
+    Args:
+        path: file.
+
+    Returns:
+        Arrays `(n,)`, `(n, c)`, or `(n, 3, 3)` for nine components, by name. What `read` puts
+        into the cloud itself (normals, boundary, activity, spacing) is left out.
+
+    Raises:
+        OSError, ValueError, ImportError: as `read`.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> path, cloud = pathlib.Path(folder.name) / "sphere.vtu", js.sphere(500)
+        >>> js.write(path, cloud, {"height": cloud.points[:, 2]})
+        >>> js.read_fields(path)["height"].shape
+        (500,)
+    """
+    fields = contents_of(path).fields
+    return {
+        name: v.reshape(-1, 3, 3) if v.shape[1:] == (9,) else v
+        for name, v in fields.items()
+        if name not in _OWN
+    }
+
+
+def write(
+    path: str | Path,
+    cloud: PointCloud,
+    fields: Mapping[str, Float[Array, "n ..."]] | None = None,
+) -> None:
+    """File with the points, normals and fields, for ParaView and for `read`.
+
+    VTU and VTK hold scalars `(n,)`, vectors `(n, c)` and tensors `(n, d, d)`; PLY holds scalars,
+    and vectors as one scalar per component (`name_0`, `name_1`, …); XYZ holds points and normals
+    only. Plane curves are put at z = 0, their vectors and tensors filled with zeros. Boundary,
+    activity and spacing go along where the cloud has them, except to XYZ. (In ParaView, choose
+    *Point Gaussian* to see the points as a surface.)
+
+    Args:
+        path: .vtu, .vtk, .ply or .xyz; overwritten if it exists.
+        cloud: n points.
+        fields: arrays with one row per point, by name.
+
+    Raises:
+        ValueError: unknown suffix; a field with another number of rows (both numbers given), of
+            a shape or kind that the format does not hold, or with a name that is taken.
+        OSError: the file cannot be written.
+        ImportError: meshio is needed and absent.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> cloud = js.sphere(500)
+        >>> js.write(pathlib.Path(folder.name) / "sphere.vtu", cloud, {"x": cloud.points[:, 0]})
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".vtu", ".vtk", ".ply", ".xyz"):
+        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; written are .vtu .vtk .ply .xyz")
+    points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+    if suffix == ".xyz":
+        if fields:
+            raise ValueError(f"{path}: XYZ holds no fields ({', '.join(fields)}); take .vtu")
+        names = "x y nx ny" if cloud.dim == 2 else "x y z nx ny nz"
+        np.savetxt(path, np.hstack([points, normals]), fmt="%.17g", header=names)
+        return
+    data = {"normals": _in_space("normals", normals, cloud)}
+    for name, value in (fields or {}).items():
+        if name in ("normals", "nx", "ny", "nz", "x", "y", "z", *_OWN):
+            raise ValueError(f"the name {name!r} is taken by the cloud itself")
+        data[name] = _in_space(name, np.asarray(value), cloud)
+    for name in _OWN:
+        if (value := getattr(cloud, name)) is not None:
+            data[name] = _in_space(name, np.asarray(value), cloud)
+    place = np.pad(points, ((0, 0), (0, 3 - cloud.dim)))
+    library = meshio()
+    if suffix == ".ply":
+        mesh = library.Mesh(place, [], point_data=_columns(data))
+        library.ply.write(path, mesh)
+    else:
+        cells = [("vertex", np.arange(cloud.n)[:, None])]
+        mesh = library.Mesh(place, cells, point_data=data)
+        (library.vtu if suffix == ".vtu" else library.vtk).write(path, mesh)
+
+
+def _in_space(name: str, value: np.ndarray, cloud: PointCloud) -> np.ndarray:
+    """A field as `(n,)` or `(n, c)` in types that files hold, with vectors in space."""
+    if value.ndim not in (1, 2, 3) or value.shape[0] != cloud.n:
+        raise ValueError(f"field {name!r} has shape {value.shape}, expected ({cloud.n}, ...)")
+    if value.ndim == 3 and value.shape[1:] != (cloud.dim, cloud.dim):
+        d = cloud.dim
+        raise ValueError(f"tensor {name!r} has shape {value.shape}, expected ({cloud.n}, {d}, {d})")
+    if value.dtype == bool:
+        value = value.astype(np.uint8)
+    if value.dtype.kind not in "iuf" and value.dtype != jnp.bfloat16:
+        raise ValueError(f"field {name!r} holds {value.dtype}, expected real numbers")
+    if value.dtype.itemsize == 2 and value.dtype.kind not in "iu":
+        value = value.astype(np.float32)
+    lack = 3 - cloud.dim
+    if value.ndim == 3:
+        return np.pad(value, ((0, 0), (0, lack), (0, lack))).reshape(cloud.n, 9)
+    if value.ndim == 2 and value.shape[1] == cloud.dim:
+        return np.pad(value, ((0, 0), (0, lack)))
+    return value
+
+
+def _columns(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Scalars with names that PLY allows."""
+    columns: dict[str, np.ndarray] = {}
+    for name, value in data.items():
+        if name.split() != [name]:
+            raise ValueError(f"PLY allows no blanks in names of fields: {name!r}")
+        if value.dtype.itemsize == 8 and value.dtype.kind in "iu":
+            value = value.astype(np.int32)
+        if name == "normals":
+            columns.update(zip(("nx", "ny", "nz"), value.T))
+        elif value.ndim == 2:
+            columns.update({f"{name}_{i}": column for i, column in enumerate(value.T)})
+        else:
+            columns[name] = value
+    return columns

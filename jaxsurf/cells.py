@@ -212,9 +212,7 @@ def search_neighbors(
         k_needed=count.max() if k is None else full,
         k_found=count.max() if k is None else jnp.min(jnp.where(on, count, full)),
         candidates_needed=needed.max(),
-        point=jnp.where(
-            needed.max() > capacity.candidates, jnp.argmax(needed), jnp.argmax(count)
-        ),
+        point=jnp.where(needed.max() > capacity.candidates, jnp.argmax(needed), jnp.argmax(count)),
     )
     neighbors = Neighbors(indices, mask, radius if k is None else None)
     if throw:
@@ -236,7 +234,7 @@ def _pad(row, width: int, value):
     return jnp.pad(row, (0, width - len(row)), constant_values=value) if len(row) < width else row
 
 
-def _distance_key(squared: Float[Array, "..."]) -> Int[Array, "..."]:
+def _distance_key(squared: Array) -> Array:
     """The same integers as `neighbors.distance_key`."""
     if squared.dtype == jnp.float32:
         return (jax.lax.bitcast_convert_type(squared, jnp.int32) + (1 << 7)) >> 8

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from .cloud import PointCloud, is_concrete, raise_at
 
-# Two points count as opposite if their normals differ by more than 120 degrees.
-_OPPOSITE = -0.5
+# Normals more than about 140 degrees apart are opposite: bends that sharp are not resolved.
+_OPPOSITE = -0.75
 # Points used to measure the local spacing: about two rings around a point.
 _RINGS = 13
 # A duplicate is a pair closer than this fraction of the spacing.
@@ -94,7 +94,7 @@ def find_neighbors(
     """
     if (k is None) == (radius is None):
         raise ValueError("give exactly one of k and radius")
-    if not is_concrete(cloud.points, cloud.normals, cloud.active, radius):
+    if not is_concrete(*jax.tree.leaves((cloud, radius))):
         raise ValueError(
             "find_neighbors needs concrete arrays; under jit, vmap or grad use search_neighbors"
         )
@@ -111,7 +111,7 @@ def find_neighbors(
     if throw:
         check_orientation(points, normals, tree, names=rows)
     if k is not None:
-        slots, mask = _nearest(points, normals, tree, k, min_cosine)
+        slots, mask = nearest(points, normals, tree, k, min_cosine)
     else:
         reach = np.broadcast_to(np.asarray(radius, points.dtype), cloud.n)
         raise_at(on & ~(reach > 0), "radius of point {i} is {v}, expected a positive number", reach)
@@ -151,7 +151,7 @@ def cosine_slack(dtype) -> float:
 # --- the two searches on the host ----------------------------------------------------------
 
 
-def _nearest(points, normals, tree, k: int, min_cosine: float):
+def nearest(points, normals, tree, k: int, min_cosine: float):
     """The k nearest acceptable points of each, from as many candidates as that takes."""
     n = len(points)
     slots = np.tile(np.arange(n)[:, None], k)
@@ -273,7 +273,7 @@ def check_orientation(
     d = points[found] - points[rows][:, None]
     distance = np.linalg.norm(d, axis=2)
     height = np.abs(np.einsum("nkd,nd->nk", d, normals[rows]))
-    same = np.einsum("nd,nkd->nk", normals[rows], normals[found]) > -_OPPOSITE
+    same = np.einsum("nd,nkd->nk", normals[rows], normals[found]) > 0.5
     spacing = _spacing_from_count(distance[:, -1], count, points.shape[1])
     # The second nearest of my own orientation, so that a border does not count as sparse.
     sheet = np.sort(np.where(same, distance, distance[:, -1:]), axis=1)[:, min(2, count - 1)]
@@ -345,6 +345,7 @@ def tube_ratio(cloud: PointCloud, neighbors: Neighbors) -> Float[Array, " n"]:
         >>> float(js.tube_ratio(cloud, js.find_neighbors(cloud, k=5)).max().round(6))
         0.5
     """
+
     # One column of neighbours at a time: nothing of size (n, k, d) is stored.
     def bend(slot, mask):
         d = cloud.points[slot] - cloud.points

@@ -1,0 +1,141 @@
+"""First guess of the normals of a bare point cloud, and which way they point (on the host)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.spatial import cKDTree
+
+from .neighbors import check_orientation
+
+# Neighbours used for the first guess: one ring and a half, so that thin parts stay apart.
+_NEAR = {2: 5, 3: 13}
+# Edges steeper than this against the surface lead to another sheet.
+_STEEP = 0.7
+
+
+def plane_normals(points: np.ndarray, tree: cKDTree, *, k: int | None = None) -> np.ndarray:
+    r"""Unit normals of unknown sign: the n that minimises $\sum_j W_{ij}\cos^2\theta_{ij}$.
+
+    $\theta_{ij}$ is the angle between n and $x_j-x_i$, W Gaussian (Suchde and Kuhnert 2019,
+    eq. 4): the weighted principal axes of the unit directions to the neighbours.
+    """
+    n, dim = points.shape
+    count = min(n, _NEAR[dim] if k is None else k)
+    if count < dim:
+        raise ValueError(f"too few points: {n}, normals in {dim} dimensions need {dim}")
+    distance, found = tree.query(points, count, workers=-1)
+    d = (points[found[:, 1:]] - points[:, None]) / distance[:, 1:, None]
+    w = np.exp(-2 * (distance[:, 1:] / distance[:, -1:]) ** 2)
+    value, axes = np.linalg.eigh(np.einsum("nk,nki,nkj->nij", w, d, d))
+    # In space two axes must carry the neighbours, or they all lie on a line.
+    line = np.flatnonzero(value[:, -2] < 1e-8 * value[:, -1]) if dim == 3 else np.empty(0, int)
+    if line.size:
+        raise ValueError(
+            f"the {count} nearest points around point {line[0]} lie on a line "
+            f"({line.size} such points): they determine no normal"
+        )
+    return axes[:, :, 0]
+
+
+def orient(points: np.ndarray, normals: np.ndarray, tree: cKDTree) -> np.ndarray:
+    r"""The normals with signs chosen so that they agree over each surface, outward if closed.
+
+    Signs spread along a minimum spanning tree of the neighbour graph (Hoppe et al. 1992). Two
+    neighbours on a circular arc have normals that are mirror images in the plane halfway
+    between them; an edge costs as much as it departs from that. It also holds between the
+    two sides of a thin part, which then get opposite normals, as they must.
+    """
+    n, dim = points.shape
+    count = min(n, _NEAR[dim])
+    found = tree.query(points, count, workers=-1)[1][:, 1:]
+    i, j = np.repeat(np.arange(n), count - 1), found.ravel()
+    agreement, steep = _compare(points, normals, i, j)
+    cost = 1 - np.abs(agreement) + steep**2
+    tree_edges = minimum_spanning_tree(_symmetric(i, j, cost + 1e-9, n)).tocoo()
+    i, j = tree_edges.row, tree_edges.col
+    agreement, steep = _compare(points, normals, i, j)
+    sign = _spread(n, i, j, np.where(agreement < 0, -1, 1))
+    normals = normals * sign[:, None]
+    return normals * _outward(points, normals, _sheets(n, i, j, steep), tree)[:, None]
+
+
+def check_one_sided(points: np.ndarray, normals: np.ndarray, tree: cKDTree) -> None:
+    check_orientation(
+        points,
+        normals,
+        tree,
+        names=np.arange(len(points)),
+        message="neighbouring points {i} and {j} got opposite normals (cosine {c:.2f}): the "
+        "surface has one side only, like a Moebius strip, or too few points where it bends",
+    )
+
+
+def _compare(points, normals, i, j):
+    """Cosine between n_j and the mirror image of n_i, and how steep the edge is."""
+    e = points[j] - points[i]
+    e /= np.linalg.norm(e, axis=1, keepdims=True)
+    up_i = np.einsum("nd,nd->n", normals[i], e)
+    up_j = np.einsum("nd,nd->n", normals[j], e)
+    agreement = np.einsum("nd,nd->n", normals[i], normals[j]) - 2 * up_i * up_j
+    return agreement, np.maximum(np.abs(up_i), np.abs(up_j))
+
+
+def _symmetric(i, j, value, n: int) -> csr_matrix:
+    graph = csr_matrix((value, (i, j)), shape=(n, n))
+    return graph.maximum(graph.T)
+
+
+def _spread(n: int, i, j, flip) -> np.ndarray:
+    """Sign of every node of a forest, from the signs of its edges."""
+    forest = _symmetric(i, j, np.ones(len(i)), n)
+    _, piece = connected_components(forest, directed=False)
+    roots = np.unique(piece, return_index=True)[1]
+    # One more node joins the trees, so that one sweep visits all.
+    joined = _symmetric(
+        np.r_[i, roots], np.r_[j, np.full(len(roots), n)], np.ones(len(i) + len(roots)), n + 1
+    )
+    _, parent = breadth_first_order(joined, n, directed=False)
+    parent[n] = n
+    sign_of_edge = _symmetric(i, j, flip + 2.0, n + 1)  # 1 or 3: zeros are not stored
+    node = np.arange(n + 1)
+    sign = np.asarray(sign_of_edge[node, parent]).ravel()
+    sign = np.where(sign == 1, -1, 1)
+    # Product of the signs along the way to the root, doubling the stride.
+    while np.any(parent != n):
+        sign, parent = sign * sign[parent], parent[parent]
+    return sign[:n]
+
+
+def _sheets(n: int, i, j, steep) -> np.ndarray:
+    """Label of the surface that each point belongs to: trees without their steep edges."""
+    flat = steep < _STEEP
+    _, label = connected_components(_symmetric(i[flat], j[flat], np.ones(flat.sum()), n), False)
+    size = np.bincount(label)
+    # A scrap, as at a sharp tip, follows the sheet it hangs on.
+    while True:
+        a, b = label[i], label[j]
+        scrap = (a != b) & (np.minimum(size[a], size[b]) < 50)
+        if not scrap.any():
+            return label
+        e = np.flatnonzero(scrap)[0]
+        small, large = (a[e], b[e]) if size[a[e]] < size[b[e]] else (b[e], a[e])
+        label[label == small] = large
+        size[large] += size[small]
+        size[small] = 0
+
+
+def _outward(points, normals, label, tree: cKDTree) -> np.ndarray:
+    """Sign per point that makes the enclosed volume of each surface positive."""
+    dim = points.shape[1]
+    area = tree.query(points, [min(len(points), _NEAR[dim])], workers=-1)[0][:, 0] ** (dim - 1)
+    size = np.maximum(np.bincount(label), 1)
+    centre = np.stack([np.bincount(label, c) / size for c in points.T], axis=1)
+    flux = area * np.einsum("nd,nd->n", points - centre[label], normals)
+    total, scale = np.bincount(label, flux), np.bincount(label, np.abs(flux))
+    # An open flat sheet encloses nothing: its first normal component that counts is positive.
+    mean = np.stack([np.bincount(label, c) / size for c in normals.T], axis=1)
+    leading = mean[np.arange(len(mean)), np.argmax(np.abs(mean).round(6), axis=1)]
+    flat = np.abs(total) <= 1e-6 * scale.max(initial=0)
+    return np.where(np.where(flat, leading, total) < 0, -1, 1)[label]

@@ -157,14 +157,16 @@ def _off(path: Path) -> Contents:
             f"line {number}: expected the numbers of vertices and faces, found {counts}"
         ) from None
     with_normals = "N" in (kind.group(1) or "")
-    rows, runs = [], []
+    rows: list[list[float]] = []
+    runs: list[list[list[int]]] = []
+    found = 0
     for number, line in lines:
         word = line.split()
         try:
             if len(rows) < n:
                 rows.append(_numbers(word, 6 if with_normals else 3))
                 continue
-            if sum(map(len, runs)) == m:
+            if found == m:
                 break
             size = int(word[0])
             if size < 3 or len(word) < size + 1:
@@ -175,8 +177,9 @@ def _off(path: Path) -> Contents:
         if not runs or len(runs[-1][-1]) != size:
             runs.append([])
         runs[-1].append(face)
+        found += 1
     _complete("vertices", n, len(rows))
-    _complete("faces", m, sum(map(len, runs)))
+    _complete("faces", m, found)
     x = np.array(rows, float).reshape(-1, 6 if with_normals else 3)
     return Contents(x[:, :3], [np.array(run) for run in runs], x[:, 3:] if with_normals else None)
 

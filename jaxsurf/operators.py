@@ -321,7 +321,7 @@ def _build(cloud, neighbors, method, target, throw) -> Stencil:
         neighbors, laplacian = _adapted(cloud, method, throw)
         if isinstance(target, Laplacian):
             weights = laplacian
-    _check_sizes(cloud, neighbors, method, target)
+    _check_sizes(cloud, neighbors, method, target, throw)
     if weights is None:
         weights = _weights(cloud, neighbors, method, target)
     values, diagnostics = weights
@@ -359,7 +359,7 @@ def _adapted(cloud, method, throw) -> tuple[Neighbors, tuple | None]:
     on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
     k = min(method.neighbor_count(cloud.dim), int(on.sum()))
     neighbors = find_neighbors(cloud, k, throw=throw)
-    _check_sizes(cloud, neighbors, method, Laplacian())
+    _check_sizes(cloud, neighbors, method, Laplacian(), throw)
     weights = _weights(cloud, neighbors, method, Laplacian())
     poor = on & _is_poor(*weights)
     if not poor.any():
@@ -402,11 +402,11 @@ def _tolerance(dtype) -> float:
     return float(np.finfo(dtype).eps) ** 0.5
 
 
-def _check_sizes(cloud, neighbors, method, target) -> None:
+def _check_sizes(cloud, neighbors, method, target, throw) -> None:
     if neighbors.n != cloud.n:
         raise ValueError(f"neighbours of {neighbors.n} points, the cloud has {cloud.n}")
     need = method.basis_size(cloud.dim, target)
-    if neighbors.k < need:
+    if throw and neighbors.k < need:
         raise ValueError(f"k = {neighbors.k} neighbours, {method} needs at least {need}")
 
 

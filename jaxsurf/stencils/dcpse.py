@@ -132,7 +132,7 @@ _SURFACE_COUNT = {1: 24, 2: 36, 3: 45, 4: 66, 5: 80, 6: 100}
 
 
 def _width(order: int) -> float:
-    return 0.41 if order <= 2 else 0.325
+    return 0.41 if order <= 2 else 0.3
 
 
 def _layers(order: int) -> int:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from .cloud import is_concrete
 from .neighbors import Neighbors, cosine_slack
@@ -108,15 +109,12 @@ def allocate(
     if not radius > 0:
         raise ValueError(f"radius is {radius}, expected a positive number")
     points = jnp.asarray(points)
-    _, length, _ = _candidates(points, radius, _all_on(points, active))
-    most = int(length.sum(axis=1).max())
-    _, report = search_neighbors(
-        points, radius=radius, capacity=SearchCapacity(1, most), active=active, throw=False
-    )
-    return SearchCapacity(
-        min(len(points), math.ceil(margin * int(report.k_needed))),
-        min(len(points), math.ceil(margin * most)),
-    )
+    on = _all_on(points, active)
+    candidates = int(jax.jit(_candidates)(points, radius, on)[1].sum(axis=1).max())
+    x = np.asarray(points, float)[np.asarray(on)]
+    k = int(cKDTree(x).query_ball_point(x, radius * (1 + 1e-6), return_length=True).max())
+    n = len(points)
+    return SearchCapacity(min(n, math.ceil(margin * k)), min(n, math.ceil(margin * candidates)))
 
 
 @eqx.filter_jit

@@ -234,13 +234,11 @@ def check_spacing(points: np.ndarray, tree: cKDTree, *, names: np.ndarray) -> No
     """Raise if two points coincide."""
     if len(points) < 2:
         raise ValueError(f"too few points: {len(points)}, at least 2 are needed")
-    distance, other = tree.query(points, [2], workers=-1)
-    distance, other = distance[:, 0], other[:, 0]
+    distance = tree.query(points, [2], workers=-1)[0][:, 0]
     where = np.flatnonzero(distance <= _DUPLICATE * np.median(distance))
     if where.size:
         i = where[0]
-        # With several copies, the second nearest may be the point itself.
-        j = other[i] if other[i] != i else tree.query(points[i], [1])[1][0]
+        j = next(j for j in tree.query(points[i], 2)[1] if j != i)
         raise ValueError(
             f"points {names[i]} and {names[j]} coincide (distance {distance[i]:.3g}, "
             f"spacing {np.median(distance):.3g}); {where.size} points have a duplicate"
@@ -275,8 +273,10 @@ def check_orientation(
     height = np.abs(np.einsum("nkd,nd->nk", d, normals[rows]))
     same = np.einsum("nd,nkd->nk", normals[rows], normals[found]) > 0.5
     spacing = _spacing_from_count(distance[:, -1], count, points.shape[1])
-    # The second nearest of my own orientation, so that a border does not count as sparse.
-    sheet = np.sort(np.where(same, distance, distance[:, -1:]), axis=1)[:, min(2, count - 1)]
+    # Spacing of my own sheet: by count, unless there is a border, which leaves half a ring empty.
+    second = np.sort(np.where(same, distance, distance[:, -1:]), axis=1)[:, min(2, count - 1)]
+    counted = _spacing_from_count(distance[:, -1], same.sum(axis=1), points.shape[1])
+    sheet = np.minimum(second, counted)
     flat = opposite & (height <= 0.3 * distance) & (distance <= 1.5 * spacing[:, None])
     # Nearest point of my own orientation to each candidate, over the tangent plane.
     flat_d = d - np.einsum("nkd,nd->nk", d, normals[rows])[..., None] * normals[rows][:, None]
@@ -285,6 +285,8 @@ def check_orientation(
     mine[:, 0] = False
     covered = (np.where(mine[:, None, :], apart, np.inf).min(axis=2)) < 0.5 * distance
     flipped = flat & ~covered
+    # One such neighbour may be noise at a sharp fold; a seam shows several at a surface point.
+    flipped &= flipped.sum(axis=1, keepdims=True) >= points.shape[1] - 1
     if flipped.any():
         r, c = np.argwhere(flipped)[0]
         i, j = rows[r], found[r, c]

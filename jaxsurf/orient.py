@@ -39,7 +39,7 @@ def plane_normals(points: np.ndarray, tree: cKDTree, *, k: int | None = None) ->
     return axes[:, :, 0]
 
 
-def orient(points: np.ndarray, normals: np.ndarray, tree: cKDTree) -> np.ndarray:
+def orient_normals(points: np.ndarray, normals: np.ndarray, tree: cKDTree) -> np.ndarray:
     r"""The normals with signs chosen so that they agree over each surface, outward if closed.
 
     Signs spread along a minimum spanning tree of the neighbour graph (Hoppe et al. 1992). Two

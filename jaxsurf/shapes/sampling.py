@@ -164,7 +164,7 @@ def relax(
         Points and normals, `(n, d)` each.
 
     Raises:
-        ValueError: `project` returned something that is not finite, named by point.
+        ValueError: `project` cannot put a given point on the surface, named by point.
 
     Accuracy: after `thin`, smallest distance above 0.75 h and no hole of radius above 0.9 h
         (`tests/test_sampling.py::test_relaxed_points_are_even`).
@@ -199,7 +199,11 @@ def relax(
         move -= normals[free] * np.sum(move * normals[free], axis=1, keepdims=True)
         length = np.maximum(np.linalg.norm(move, axis=1, keepdims=True), 1e-300)
         moved = points[free] + move * np.minimum(1, 0.2 * spacing / length)
-        points[free], normals[free] = _projected(moved, project)
+        onto, found = (np.asarray(a, float) for a in project(moved))
+        # A point moved to where the surface cannot be found again waits for the next step.
+        ok = np.isfinite(onto).all(axis=1) & np.isfinite(found).all(axis=1)
+        rows = np.flatnonzero(free)[ok]
+        points[rows], normals[rows] = onto[ok], found[ok]
     return points, normals
 
 
@@ -245,7 +249,7 @@ def quasi_uniform(
     """
     candidates = np.asarray(candidates, float)
     spacing = ideal_spacing(measure, n, dim=candidates.shape[1])
-    if fixed is None:
+    if fixed is None or len(fixed[0]) == 0:
         chosen = thin(candidates, n, normals=normals, seed=seed)
         return relax(candidates[chosen], project, spacing=spacing, steps=steps)
     held, held_normals = (np.asarray(a, float) for a in fixed)
@@ -309,7 +313,8 @@ def jitter(
         stays |= np.asarray(cloud.boundary)
     if cloud.active is not None:
         stays |= ~np.asarray(cloud.active)
-    rng = np.random.default_rng(seed)
+    # Not the stream of `default_rng(seed)`, from which the points themselves may have come.
+    rng = np.random.default_rng((seed, 1))
     direction = rng.normal(size=points.shape)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     move = direction * (fraction * spacing * rng.random((cloud.n, 1)) ** (1 / cloud.dim))

@@ -302,7 +302,7 @@ def jitter(
     Example:
         >>> cloud = js.sphere(1_000)
         >>> h = ideal_spacing(4 * np.pi, 1_000)
-        >>> moved = jitter(cloud, sphere_projection(), spacing=h)
+        >>> moved = jitter(cloud, js.shapes.analytic.sphere_projection(), spacing=h)
         >>> bool(jnp.linalg.norm(moved.points - cloud.points, axis=1).max() <= 0.26 * h)
         True
     """

@@ -23,15 +23,11 @@ def gaussian(r2: Float[Array, "*q"], width, radius) -> Float[Array, "*q"]:
     return jnp.exp(-r2 / width**2) * taper(r2 / radius**2)
 
 
-def soft_count(r2: Float[Array, " k"], mask: Bool[Array, " k"], radius) -> Float[Array, ""]:
-    """Number of points within the radius, as a twice differentiable function of the distances."""
-    return jnp.sum(jnp.where(mask, taper(r2 / radius**2), 0))
-
-
-# Of k listed neighbours the support takes in so many, softly counted, that on even points it
-# ends well before the last of the list: the mean of the taper over a disc is 0.66, so that
-# about three quarters of the list lie within.
-_SOFT_FRACTION = 0.5
+# Of k listed neighbours the support takes in about three quarters on even points, so that it
+# ends well before the last of the list also where points are uneven.
+_SHARE = 0.76
+# Mean over the unit ball of the weight that counts a neighbour, (1 - s)^3, by dimension.
+_MEAN_WEIGHT = {1: 16 / 35, 2: 1 / 4, 3: 16 / 105}
 
 
 def support(
@@ -43,9 +39,10 @@ def support(
 ) -> Float[Array, ""]:
     r"""Support radius $\rho$ of one neighbourhood: the given one, or one that the points fill.
 
-    Without a given radius it is the length at which the soft count of neighbours reaches a
-    fixed share of the list. That is a smooth function of the distances, and points near the end
-    of the list have no say in it, so that it does not jump when the list changes there.
+    Without a given radius it is the length at which the neighbours, counted with weights that
+    vanish there, reach a fixed share of the list. That is a smooth function of the distances,
+    and points near the end of the list have no say in it, so that it does not jump when the
+    list changes there.
 
     Args:
         r2: squared distances to the neighbours, the point itself first.
@@ -56,7 +53,8 @@ def support(
     Differentiable: forward and reverse; the root by the implicit function theorem.
     """
     if radius is None:
-        return _soft_radius(r2, mask, _SOFT_FRACTION * jnp.maximum(jnp.sum(mask), 2), dim)
+        target = _SHARE * _MEAN_WEIGHT[dim] * jnp.sum(mask)
+        return _soft_radius(r2, mask, jnp.maximum(target, 1.2), dim)
     return jnp.asarray(radius, r2.dtype)
 
 
@@ -64,18 +62,27 @@ def _soft_radius(r2, mask, target, dim):
     frozen = jax.lax.stop_gradient(r2)
     mask = mask.at[0].set(True)  # the point itself, also in rows that are switched off
 
-    def count_and_slope(t):
-        count, slope = jax.value_and_grad(lambda t: soft_count(frozen, mask, jnp.exp(t)))(t)
-        # In an even set log(count) grows like dim * t; a slope far below that is a plateau.
-        return count, jnp.maximum(slope, 0.2 * dim * count)
+    def count(r2, t):
+        s = jnp.minimum(r2 * jnp.exp(-2 * t), 1)
+        return jnp.sum(jnp.where(mask, (1 - s) ** 3, 0))
 
-    def newton(_, t):
-        count, slope = count_and_slope(t)
-        return t + jnp.log(target / count) * count / slope
+    def slope(t):
+        s = jnp.minimum(frozen * jnp.exp(-2 * t), 1)
+        return jnp.sum(jnp.where(mask, 6 * s * (1 - s) ** 2, 0))
 
-    farthest = jnp.max(jnp.where(mask, frozen, 0))
-    start = 0.5 * jnp.log(jnp.where(farthest > 0, farthest, 1))
-    t = jax.lax.fori_loop(0, 10, newton, start)
+    def newton(_, state):
+        # In an even set log(count) is a straight line in t = log(radius), nearly; where a step
+        # leaves the bracket, it is halved instead.
+        low, high, t = state
+        value = count(frozen, t)
+        low, high = jnp.where(value < target, t, low), jnp.where(value < target, high, t)
+        step = t + jnp.log(target / value) * value / jnp.maximum(slope(t), 1e-3 * value)
+        inside = (step >= low) & (step <= high)
+        return low, high, jnp.where(inside, step, (low + high) / 2)
+
+    # The radius that holds the share of the list, hard counted, is a good start.
+    start = jnp.sort(jnp.where(mask, frozen, 0))[-1 - jnp.sum(mask) * 6 // 25]
+    start = 0.5 * jnp.log(jnp.where(start > 0, start, 1))
+    t = jax.lax.fori_loop(0, 8, newton, (start - 5, start + 5, start))[2]
     # One more step, the only one that is differentiated: the implicit function theorem.
-    _, slope = count_and_slope(t)
-    return jnp.exp(t + (target - soft_count(r2, mask, jnp.exp(t))) / slope)
+    return jnp.exp(t + (target - count(r2, t)) / jnp.maximum(slope(t), 1e-3))

@@ -1,0 +1,66 @@
+"""What several test files share: clouds, fields with known derivatives, central differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxsurf as js
+
+METHODS = [js.DCPSE(order=2), js.DCPSE(order=4), js.GFDM(degree=2), js.GFDM(degree=4)]
+
+
+def label(method) -> str:
+    number = method.degree if isinstance(method, js.GFDM) else method.order
+    return f"{type(method).__name__}{number}"
+
+
+def exponential(points, rate=(1.0, 2.0, 1.5)):
+    """u = exp(a·x) on the unit sphere with its surface gradient and Laplacian."""
+    a = jnp.array(rate)
+    s = points @ a
+    u = jnp.exp(s)
+    gradient = u[:, None] * (a - s[:, None] * points)
+    return u, gradient, u * (a @ a - s**2 - 2 * s)
+
+
+def relative_error(value, exact) -> float:
+    return float(jnp.linalg.norm(value - exact) / jnp.linalg.norm(exact))
+
+
+def central_difference(f, x, direction, step=1e-5) -> float:
+    """Derivative of f along a direction, by two central differences extrapolated."""
+
+    def difference(h):
+        return float(f(x + h * direction) - f(x - h * direction)) / (2 * h)
+
+    return (4 * difference(step / 2) - difference(step)) / 3
+
+
+def check_derivative(f, x, *, seed=0, step=1e-5, rtol=1e-6):
+    """Forward and reverse derivative of a scalar function against central differences."""
+    direction = jnp.asarray(np.random.default_rng(seed).normal(size=x.shape))
+    direction = direction / jnp.linalg.norm(direction)
+    f = jax.jit(f)
+    expected = central_difference(f, x, direction, step)
+    forward = float(jax.jvp(f, (x,), (direction,))[1])
+    reverse = float(jnp.vdot(jax.jit(jax.grad(f))(x), direction))
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    np.testing.assert_allclose(forward, expected, rtol=rtol)
+
+
+def jittered_sphere(n, seed=0, fraction=0.25) -> js.PointCloud:
+    """Fibonacci points, each moved within a ball of a fraction of the spacing."""
+    points = np.asarray(js.sphere(n).points)
+    rng = np.random.default_rng(seed)
+    step = rng.normal(size=points.shape)
+    step /= np.linalg.norm(step, axis=1, keepdims=True)
+    step *= fraction * np.sqrt(4 * np.pi / n) * rng.uniform(size=(n, 1)) ** (1 / 3)
+    points = points + step
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return js.PointCloud(points, points)
+
+
+def random_sphere(n, seed=0) -> js.PointCloud:
+    points = np.random.default_rng(seed).normal(size=(n, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return js.PointCloud(points, points)

@@ -1,0 +1,140 @@
+import itertools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsurf.stencils.kernels import gaussian, support, taper
+from jaxsurf.stencils.moments import blockwise, moment_solve
+from jaxsurf.stencils.monomials import differentiation, monomials, multi_indices
+from jaxsurf.stencils.targets import Gradient, Hessian, Laplacian, Partial
+
+from .helpers import check_derivative
+
+
+@pytest.mark.parametrize("dim, high", [(1, 4), (2, 5), (3, 6)])
+def test_monomials_are_powers(dim, high):
+    x = np.random.default_rng(0).normal(size=(dim, 7))
+    indices = multi_indices(dim, 0, high)
+    assert len(indices) == math.comb(dim + high, dim)
+    expected = np.prod(x[None] ** indices[:, :, None], axis=1)
+    np.testing.assert_allclose(monomials(jnp.asarray(x), high), expected, rtol=1e-13)
+
+
+def test_differentiation_matrices_differentiate():
+    x = jnp.array([[0.3], [-0.7], [1.1]])
+    a = np.random.default_rng(1).normal(size=len(multi_indices(3, 0, 4)))
+
+    def polynomial(x):
+        return (a @ monomials(x, 4))[0]
+
+    gradient = jax.grad(polynomial)(x)[:, 0]
+    matrices = differentiation(3, 4)
+    np.testing.assert_allclose([(d @ a) @ monomials(x, 4)[:, 0] for d in matrices], gradient)
+
+
+@pytest.mark.parametrize("low, high", [(0, 3), (1, 3), (1, 5)])
+def test_moments_are_met(low, high):
+    rng = np.random.default_rng(2)
+    x, w = jnp.asarray(rng.uniform(-1, 1, (3, 200))), jnp.asarray(rng.uniform(0.1, 1, 200))
+    b = jnp.asarray(np.concatenate([t.moments(3, low, high) for t in (Laplacian(), Hessian())], 1))
+    eta, condition, residual = moment_solve(x, w, b, low, high)
+    basis = monomials(x, high)[len(multi_indices(3, 0, low - 1)) :]
+    np.testing.assert_allclose(basis @ eta.T, b, atol=1e-11)
+    assert residual < 1e-12
+    gram = (basis * w) @ basis.T
+    scale = 1 / np.sqrt(np.diag(gram))
+    exact = np.linalg.cond(gram * scale * scale[:, None])
+    assert exact / 1000 < condition <= exact
+
+
+def test_weights_are_the_smallest_that_meet_the_moments():
+    rng = np.random.default_rng(3)
+    x, w = jnp.asarray(rng.uniform(-1, 1, (2, 20))), jnp.asarray(rng.uniform(0.1, 1, 20))
+    b = jnp.asarray(Laplacian().moments(2, 1, 3))
+    eta = moment_solve(x, w, b, 1, 3)[0][0]
+    basis = np.asarray(monomials(x, 3)[1:])
+    root = np.sqrt(np.asarray(w))
+    expected = root * np.linalg.lstsq(basis * root, np.asarray(b[:, 0]), rcond=None)[0]
+    np.testing.assert_allclose(eta, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_targets():
+    assert Partial((2, 1)).moments(2, 0, 3)[7] == 2 and Partial((2, 1)).order == 3
+    rows = Gradient().moments(3, 0, 1)
+    np.testing.assert_array_equal(rows, [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    weights = jnp.arange(3.0)[:, None]
+    turn = jnp.array([[0.6, 0.8], [-0.8, 0.6]])
+    full = Hessian().assemble(weights, turn)[:, :, 0]
+    np.testing.assert_allclose(full, turn.T @ jnp.array([[0.0, 1.0], [1.0, 2.0]]) @ turn)
+
+
+@pytest.mark.parametrize("which", ["x", "w"])
+def test_derivative_of_weights(which):
+    rng = np.random.default_rng(4)
+    x, w = jnp.asarray(rng.uniform(-1, 1, (3, 120))), jnp.asarray(rng.uniform(0.1, 1, 120))
+    g = jnp.asarray(rng.normal(size=(3, 120)))
+    b = jnp.asarray(Gradient().moments(3, 0, 3))
+
+    def f(value):
+        arguments = (value, w) if which == "x" else (x, value)
+        return jnp.sum(g * moment_solve(*arguments, b, 0, 3)[0])
+
+    check_derivative(f, x if which == "x" else w, step=1e-4, rtol=1e-8)
+
+
+def test_derivative_where_points_have_no_weight():
+    rng = np.random.default_rng(5)
+    x, w = jnp.asarray(rng.uniform(-1, 1, (2, 30))), jnp.asarray(rng.uniform(0.1, 1, 30))
+    x, w = x.at[:, 20:].set(0), w.at[20:].set(0)
+    b = jnp.asarray(Laplacian().moments(2, 1, 3))
+    padded = jax.grad(lambda x: jnp.sum(jnp.sin(moment_solve(x, w, b, 1, 3)[0])))(x)
+    short = jax.grad(lambda x: jnp.sum(jnp.sin(moment_solve(x, w[:20], b, 1, 3)[0])))(x[:, :20])
+    np.testing.assert_allclose(padded[:, :20], short, rtol=1e-10)
+    assert jnp.isfinite(padded).all()
+
+
+def test_degenerate_points_are_reported():
+    x = jnp.stack([jnp.linspace(-1, 1, 30), jnp.zeros(30)])  # all on a line
+    b = jnp.asarray(Laplacian().moments(2, 1, 2))
+    _, condition, residual = moment_solve(x, jnp.ones(30), b, 1, 2)
+    assert condition > 1e12 and residual > 0.1
+
+
+def test_blocks_equal_one_batch():
+    x = jnp.arange(70.0).reshape(35, 2)
+    for size in (1, 8, 35, 100):
+        np.testing.assert_array_equal(blockwise(lambda r: jnp.sum(r**2), size, x), (x**2).sum(1))
+
+
+def test_taper_is_twice_differentiable_at_the_edge():
+    def slope(f):
+        return jax.vmap(jax.grad(f))
+
+    cut, edge = taper, jnp.array([1 - 1e-6, 1 + 1e-6])
+    for derivative in (cut, slope(cut), slope(jax.grad(cut))):
+        values = derivative(edge)
+        assert abs(values[0] - values[1]) < 1e-2 and values[1] == 0
+    assert gaussian(jnp.array(0.0), 0.3, 1.0) == 1
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_support_scales_and_does_not_jump(dim):
+    grid = np.array(list(itertools.product(range(-6, 7), repeat=dim)), float)
+    r2 = np.sort(np.sum(grid**2, axis=1))
+    k = {1: 9, 2: 37, 3: 100}[dim]
+    on = jnp.ones(k, bool)
+    radius = support(jnp.asarray(r2[:k]), on, dim=dim)
+    assert radius**2 < r2[k]  # the support ends before the list does
+    np.testing.assert_allclose(support(jnp.asarray(9 * r2[:k]), on, dim=dim), 3 * radius)
+    # Points beyond the support have no say, whether they are listed or not.
+    moved = jnp.asarray(r2[:k]).at[-1].mul(1.5)
+    np.testing.assert_allclose(support(moved, on, dim=dim), radius, rtol=1e-6)
+
+
+def test_derivative_of_support():
+    r2 = jnp.asarray(np.sort(np.random.default_rng(0).uniform(0, 1, 30)))
+    r2 = r2.at[0].set(0)
+    check_derivative(lambda r: support(r, jnp.ones(30, bool), dim=2), r2, rtol=1e-7)

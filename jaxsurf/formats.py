@@ -226,7 +226,9 @@ _SURFACE_CELLS = ("triangle", "quad", "polygon")
 
 def _through(reader: Callable, source):
     try:
-        return reader(source)
+        # It guesses at a size from the text of an ASCII file.
+        with np.errstate(over="ignore"):
+            return reader(source)
     # They raise whatever their parsing stumbles over.
     except Exception as error:
         raise ValueError(f"not readable ({type(error).__name__}: {error})") from error
@@ -275,6 +277,10 @@ def _vtu(path: Path) -> Contents:
     return _contents(_through(meshio().vtu.read, path))
 
 
+def _native(value: Array) -> Array:
+    return value.astype(value.dtype.newbyteorder("="))
+
+
 def _contents(mesh) -> Contents:
     points = np.asarray(mesh.points, float)
     if points.ndim == 2 and points.shape[1] == 2:
@@ -287,7 +293,8 @@ def _contents(mesh) -> Contents:
             notes.append(f"{len(cells.data)} line cells ignored")
         elif cells.type != "vertex":
             raise ValueError(f"cells of type {cells.type!r} do not make a surface of polygons")
-    data = {k: np.asarray(v) for k, v in mesh.point_data.items()}
+    # VTK files are big-endian.
+    data = {k: _native(np.asarray(v)) for k, v in mesh.point_data.items()}
     normals = None
     if {"nx", "ny", "nz"} <= data.keys():
         normals = np.stack([data.pop(k) for k in ("nx", "ny", "nz")], axis=1).astype(float)

@@ -55,9 +55,9 @@ def plot_cloud(
         title: above the picture.
         cmap: matplotlib colour map; if None, a diverging one centred at zero for fields of both
             signs, else a perceptually uniform one.
-        limits: values at the ends of the colour map; if None the range of the field, or its
-            central 99 % where outliers would take most of the colours (the colour bar then has
-            pointed ends).
+        limits: values at the ends of the colour map; if None the range of the field, less the
+            outermost half per cent where these are outliers that would take most of the colours
+            (the colour bar then has a pointed end).
         view: direction from the surface to the viewer.
         up: direction that points up in the picture.
         pixels: along the longer side.
@@ -75,8 +75,8 @@ def plot_cloud(
         >>> ax = js.plot_cloud(cloud, cloud.points[:, 2], label="height", pixels=100)
     """
     pyplot = _matplotlib()
-    scene = _Scene.of(cloud, view, up, pixels)
     values = None if field is None else _checked(field, cloud)
+    scene = _Scene.of(cloud, view, up, pixels)
     if ax is None:
         ax = pyplot.subplots(figsize=(6, 5), layout="constrained")[1]
     return _draw(ax, scene, values, label=label, title=title, cmap=cmap, limits=limits)
@@ -147,8 +147,8 @@ def plot_fields(
     if not fields:
         raise ValueError("no fields to draw")
     pyplot = _matplotlib()
-    scene = _Scene.of(cloud, view, up, pixels)
     values = {k: None if v is None else _checked(v, cloud) for k, v in fields.items()}
+    scene = _Scene.of(cloud, view, up, pixels)
     columns = min(columns, len(fields))
     rows = -(-len(fields) // columns)
     size = (4.2 * columns + 0.3, 3.8 * rows)
@@ -217,8 +217,11 @@ class _Colors(NamedTuple):
     @staticmethod
     def of(values, cmap, limits) -> _Colors:
         least, most = float(values.min()), float(values.max())
-        signed = min(-least, most) > 0.02 * max(-least, most)
-        low, high = limits or _limits(values, signed)
+        low, high = limits or _limits(values)
+        signed = min(-low, high) > 0.02 * max(-low, high)
+        if signed and limits is None:
+            high = max(-low, high)
+            low = -high
         if not low < high:
             # One value everywhere: any interval around it gives one colour.
             low, high = low - (abs(low) or 1) / 2, high + (abs(high) or 1) / 2
@@ -236,13 +239,16 @@ class _Colors(NamedTuple):
         return self.mappable().to_rgba(values)[..., :3]
 
 
-def _limits(values, signed: bool) -> tuple[float, float]:
+def _limits(values) -> tuple[float, float]:
     low, high = float(values.min()), float(values.max())
-    inner = np.quantile(values, [0.005, 0.995])
-    if inner[1] - inner[0] < 0.4 * (high - low) and inner[1] > inner[0]:
-        low, high = float(inner[0]), float(inner[1])
-    most = max(abs(low), abs(high))
-    return (-most, most) if signed else (low, high)
+    inner_low, inner_high = map(float, np.quantile(values, [0.005, 0.995]))
+    far = 0.75 * (inner_high - inner_low)
+    if far == 0:
+        return low, high
+    return (
+        inner_low if low < inner_low - far else low,
+        inner_high if high > inner_high + far else high,
+    )
 
 
 # --- curves --------------------------------------------------------------------------------

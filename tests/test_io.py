@@ -1,0 +1,385 @@
+import sys
+import warnings
+from pathlib import Path
+
+import jax.numpy as jnp
+import meshio
+import numpy as np
+import pytest
+
+from jaxsurf.cloud import PointCloud
+from jaxsurf.io import read, read_fields, write
+
+from .test_meshes import ball_mesh, cube_mesh, fibonacci, mobius, real, sheet, torus_grid
+
+
+def ellipsoid(n, axes=(1.0, 0.8, 0.6)):
+    x = fibonacci(n) * axes
+    normals = x / np.array(axes) ** 2
+    return PointCloud(x, normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
+def write_obj(path, vertices, faces, extra=""):
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+    lines += ["f " + " ".join(str(i + 1) for i in face) for face in faces]
+    path.write_text("\n".join(lines) + "\n" + extra)
+    return path
+
+
+def quietly(path, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return read(path, **options)
+
+
+# --- meshes --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "suffix", ["obj", "off", "ply", "ascii.ply", "stl", "ascii.stl", "vtk", "vtu"]
+)
+def test_every_mesh_format(tmp_path, suffix):
+    mesh = ball_mesh(400)
+    path = tmp_path / f"ball.{suffix}"
+    kind = suffix.split(".")[-1]
+    options = {"binary": "ascii" not in suffix} if kind in ("ply", "stl") else {}
+    meshio.write(
+        path,
+        meshio.Mesh(mesh.vertices, [("triangle", mesh.triangles.astype(np.int32))]),
+        kind,
+        **options,
+    )
+    cloud = quietly(path)
+    x = np.asarray(cloud.points)
+    assert cloud.boundary is None and cloud.n == 400
+    if kind != "stl":
+        assert np.abs(x - mesh.vertices).max() < 1e-12
+    # Binary STL has single precision, and its own order.
+    assert np.abs(np.linalg.norm(x, axis=1) - 1).max() < 1e-6
+    assert np.abs(np.asarray(cloud.normals) - x).max() < 2e-3
+
+
+def test_mesh_normals(tmp_path):
+    errors, flat = [], []
+    for n in (1_000, 4_000):
+        mesh = ball_mesh(n, (1, 0.8, 0.6))
+        path = write_obj(tmp_path / "a.obj", mesh.vertices, mesh.triangles)
+        exact = mesh.vertices / np.array([1, 0.8, 0.6]) ** 2
+        exact /= np.linalg.norm(exact, axis=1, keepdims=True)
+        errors.append(np.abs(np.asarray(read(path).normals) - exact).max())
+        flat.append(np.abs(np.asarray(read(path, smooth=False).normals) - exact).max())
+    assert flat[1] > 1e-3
+    assert errors[1] < 3e-4
+    assert np.log2(errors[0] / errors[1]) > 3.3
+
+
+def test_border_of_an_open_mesh(tmp_path):
+    square = sheet(12)
+    cloud = read(write_obj(tmp_path / "square.obj", square.vertices, square.triangles))
+    x = np.asarray(cloud.points)
+    on_edge = ((x[:, :2] == 0) | (x[:, :2] == 1)).any(axis=1)
+    assert (np.asarray(cloud.boundary) == on_edge).all() and on_edge.sum() == 44
+    assert np.allclose(cloud.normals, [0, 0, 1])
+
+
+def test_resampling_while_reading(tmp_path):
+    mesh = ball_mesh(2_000)
+    path = write_obj(tmp_path / "ball.obj", mesh.vertices, mesh.triangles)
+    assert read(path, n=700).n == 700
+    assert abs(read(path, spacing=0.1).n - 1_257) < 10
+
+
+def test_polygons_are_cut_and_stated(tmp_path):
+    vertices, triangles = torus_grid(30, 16)
+    m = len(triangles) // 2
+    quads = np.c_[triangles[:m], triangles[m:, 2]]
+    path = write_obj(tmp_path / "quads.obj", vertices, quads.tolist())
+    with pytest.warns(UserWarning, match="quads.obj: 480 polygons with more than three corners"):
+        cloud = read(path)
+    whole = read(write_obj(tmp_path / "triangles.obj", vertices, triangles.tolist()))
+    assert cloud.n == 480 and cloud.boundary is None
+    assert np.allclose(cloud.normals, whole.normals, atol=1e-3)
+    off = tmp_path / "quads.off"
+    rows = [" ".join(map(str, v)) for v in vertices.tolist()]
+    rows += [" ".join(map(str, (4, *q))) + " 0.5 0.5 0.5" for q in quads.tolist()]
+    off.write_text("OFF 480 480 0 # torus\n\n" + "\n".join(rows))
+    assert np.allclose(quietly(off).normals, whole.normals, atol=1e-3)
+
+
+def test_textured_obj_with_relative_numbers_and_continuations(tmp_path):
+    path = tmp_path / "corner.obj"
+    path.write_text(
+        "# a comment\nmtllib none.mtl\no part\n"
+        "v 0 0 0 0.5 0.5 0.5\nv 1 0 0 1 1 1\nv 0 1 0 0 0 0\nvt 0 0\nvt 1 1\nvt 0.5 0\nvt 1 0\n"
+        "vn 0 0 2\nusemtl red\ns off\nf -3/1/1 -2/2/1 \\\n -1/3/1\nv 1 1 0\nf 2/2/1 4/4/1 3/3/-1\n"
+    )
+    cloud = read(path)
+    assert cloud.points.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]
+    assert cloud.normals.tolist() == [[0, 0, 1]] * 4
+    assert cloud.boundary.all()
+
+
+def test_normals_of_a_file_are_kept(tmp_path):
+    mesh = ball_mesh(100)
+    tilted = mesh.vertices + np.array([0, 0, 0.3])
+    extra = "".join(f"vn {x} {y} {z}\n" for x, y, z in tilted.tolist())
+    faces = [" ".join(f"{i + 1}//{i + 1}" for i in t) for t in mesh.triangles.tolist()]
+    path = write_obj(
+        tmp_path / "n.obj", mesh.vertices, [], extra + "".join(f"f {f}\n" for f in faces)
+    )
+    expected = tilted / np.linalg.norm(tilted, axis=1, keepdims=True)
+    assert np.allclose(read(path).normals, expected)
+    ply = tmp_path / "n.ply"
+    data = dict(zip(("nx", "ny", "nz"), tilted.T))
+    meshio.write(ply, meshio.Mesh(mesh.vertices, [("triangle", mesh.triangles)], point_data=data))
+    assert np.allclose(read(ply).normals, expected)
+
+
+def test_stl_corners_are_merged_and_stated(tmp_path):
+    mesh = ball_mesh(100)
+    path = tmp_path / "ball.stl"
+    meshio.write(path, meshio.Mesh(mesh.vertices, [("triangle", mesh.triangles)]))
+    with pytest.warns(UserWarning, match="588 corners of triangles merged into 100 vertices"):
+        assert read(path).n == 100
+
+
+def test_unused_vertices_are_stated(tmp_path):
+    mesh = ball_mesh(100)
+    vertices = np.concatenate([[[7.0, 7, 7]], mesh.vertices, [[8.0, 8, 8]]])
+    path = write_obj(tmp_path / "stray.obj", vertices, (mesh.triangles + 1).tolist())
+    with pytest.warns(
+        UserWarning, match=r"2 vertices belong to no triangle, dropped \(first: \[0\]"
+    ):
+        assert read(path).n == 100
+
+
+def test_ply_as_others_write_it(tmp_path):
+    mesh = ball_mesh(60)
+    text = (
+        "ply\nformat ascii 1.0\ncomment by hand\nelement vertex 60\nproperty double x\n"
+        "property double y\nproperty double z\nproperty uchar red\nelement face 116\n"
+        "property list uchar int vertex_index\nend_header\n"
+    )
+    text += "".join("{!r} {!r} {!r} 200\n".format(*v) for v in mesh.vertices.tolist())
+    text += "".join("3 {} {} {}\n".format(*t) for t in mesh.triangles.tolist())
+    path = tmp_path / "by_hand.ply"
+    path.write_text(text)
+    assert np.allclose(read(path).points, mesh.vertices)
+    assert (read_fields(path)["red"] == 200).all()
+
+
+# --- lists of points -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", ["vtu", "vtk", "ply"])
+def test_cloud_and_fields_come_back(tmp_path, suffix):
+    ball = ellipsoid(300)
+    cloud = PointCloud(
+        ball.points,
+        ball.normals,
+        boundary=ball.points[:, 2] > 0.5,
+        active=ball.points[:, 0] < 0.9,
+        spacing=jnp.full(300, 0.1),
+    )
+    fields = {
+        "height": cloud.points[:, 2],
+        "count": jnp.arange(300),
+        "flag": cloud.points[:, 1] > 0,
+        "velocity": jnp.cross(cloud.normals, cloud.points),
+        "stress": cloud.points[:, :, None] * cloud.normals[:, None, :],
+    }
+    path = tmp_path / f"cloud.{suffix}"
+    write(path, cloud, fields)
+    back, found = read(path), read_fields(path)
+    assert np.abs(back.points - cloud.points).max() < 1e-15
+    assert np.abs(back.normals - cloud.normals).max() < 1e-15
+    assert (back.boundary == cloud.boundary).all() and (back.active == cloud.active).all()
+    assert np.allclose(back.spacing, 0.1)
+    for name in ("height", "count", "flag"):
+        assert (found[name] == np.asarray(fields[name])).all()
+    if suffix == "ply":
+        assert (found["velocity_1"] == np.asarray(fields["velocity"])[:, 1]).all()
+        assert (found["stress_5"] == np.asarray(fields["stress"])[:, 1, 2]).all()
+    else:
+        assert all(value.dtype.isnative for value in found.values())
+        assert (found["velocity"] == np.asarray(fields["velocity"])).all()
+        assert (found["stress"] == np.asarray(fields["stress"])).all()
+        assert set(found) == set(fields)
+
+
+def test_paraview_gets_a_vertex_for_every_point(tmp_path):
+    path = tmp_path / "cloud.vtu"
+    write(path, ellipsoid(50), {"v": jnp.ones((50, 3), jnp.float32)})
+    mesh = meshio.read(path)
+    assert [(c.type, c.data.ravel().tolist()) for c in mesh.cells] == [("vertex", list(range(50)))]
+    assert mesh.point_data["normals"].shape == mesh.point_data["v"].shape == (50, 3)
+    assert mesh.point_data["v"].dtype == np.float32
+
+
+@pytest.mark.parametrize("suffix", ["vtu", "ply", "xyz"])
+def test_plane_curve_comes_back(tmp_path, suffix):
+    angle = 2 * np.pi * np.arange(40) / 40
+    x = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    path = tmp_path / f"curve.{suffix}"
+    fields = {"v": x, "T": x[:, :, None] * x[:, None]} if suffix == "vtu" else None
+    write(path, PointCloud(x, x), fields)
+    back = read(path)
+    assert back.dim == 2 and np.abs(back.points - x).max() < 1e-15
+    if fields:
+        assert (read_fields(path)["v"] == np.pad(x, ((0, 0), (0, 1)))).all()
+        assert (read_fields(path)["T"][:, :2, :2] == fields["T"]).all()
+
+
+def test_points_alone_get_normals(tmp_path):
+    cloud = ellipsoid(1_000)
+    for name in ("points.xyz", "points.obj", "points.off"):
+        path = tmp_path / name
+        rows = [" ".join(map(repr, p)) for p in np.asarray(cloud.points).tolist()]
+        if name.endswith("obj"):
+            rows = ["v " + row for row in rows]
+        path.write_text(("OFF\n1000 0 0\n" if name.endswith("off") else "") + "\n".join(rows))
+        back = read(path)
+        assert (back.points == cloud.points).all() and back.boundary is None
+        assert np.abs(back.normals - cloud.normals).max() < 3e-3
+
+
+# --- bad files -----------------------------------------------------------------------------
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+    "property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+)
+POINTS_PLY = PLY.replace("element face 1\nproperty list uchar int vertex_indices\n", "")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.obj", "", "a.obj: empty file"),
+        ("a.obj", "# nothing\n", "a.obj: no points"),
+        ("a.foo", "x", r"a.foo: unknown suffix '.foo'; known are .obj, .off, .ply"),
+        ("a.obj", TRIANGLE + "f 1 2 9\n", r"a.obj: triangle 0 names the vertices \[0 1 8\]"),
+        ("a.obj", TRIANGLE + "f 0 1 2\n", r"a.obj: triangle 0 names the vertices \[-1 +0 +1\]"),
+        ("a.obj", TRIANGLE + "f 1 2\n", "a.obj: line 4: a face with 2 corners"),
+        ("a.obj", "v 0 0 0\nv 1 0\n", "a.obj: line 2: expected 3 numbers, found 2"),
+        ("a.obj", "v 0 0 zero\n", "a.obj: line 1: could not convert"),
+        ("a.obj", "v 0 0 nan\n" + TRIANGLE + "f 1 2 3\n", "a.obj: vertex 0 is not finite"),
+        ("a.obj", TRIANGLE + "f 1//1 2//1 3//1\n", "a.obj: a face names normal 1, there are 0"),
+        ("a.obj", TRIANGLE + "vn 0 0 0\nf 1//1 2//1 3//1\n", "a.obj: normal 0 is"),
+        (
+            "a.obj",
+            TRIANGLE + "f 1 2 3\n",
+            "a.obj: 3 vertices, normals of degree 4 need at least 17",
+        ),
+        ("a.off", "8 6 0\n", "a.off: line 1: expected OFF"),
+        ("a.off", "OFF\n", "a.off: line 1: expected the numbers of vertices and faces"),
+        ("a.off", "OFF\n3 1 0\n0 0 0\n", "a.off: truncated: 3 vertices announced, 1 found"),
+        ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n", "a.off: truncated: 1 faces announced, 0"),
+        ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1", "a.off: line 6: expected a face of 3"),
+        (
+            "a.ply",
+            "ply\nformat ascii 1.0\n",
+            "a.ply: not a PLY file, or truncated within its header",
+        ),
+        ("a.ply", POINTS_PLY + "0 0 0\n", "a.ply: truncated: 3 vertices announced, 1 found"),
+        ("a.ply", PLY + "0 0 0\n1 0 0\n0 1 0\n", "a.ply: (not readable|truncated)"),
+        ("a.stl", "solid x\nfacet normal 0 0 1\nouter loop\n", "a.stl: truncated: no endsolid"),
+        ("a.stl", "x" * 200, "a.stl: truncated: .* bytes announced, 200 found"),
+        ("a.vtk", "# vtk DataFile Version 3.0\nx\nASCII\n", "a.vtk: not readable"),
+        ("a.vtu", "<VTKFile><Unstr", "a.vtu: not readable"),
+        ("a.xyz", "0 0 0\n1 0\n", "a.xyz: "),
+        ("a.xyz", "0 0 0 1 1\n", "a.xyz: 5 columns; expected x y"),
+        ("a.xyz", "0 0 0\n1 0 inf\n", "a.xyz: point 1 is not finite"),
+        ("a.xyz", "0 0 0 0 0 1\n1 0 0 0 0 0\n", r"a.xyz: normal 1 is \[0. 0. 0.\]"),
+        ("a.xyz", "0 0 0 0 0 1\n1 0 0 0 0 1\n0 0 0 0 0 1\n", "a.xyz: points 0 and 2 coincide"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*input contained no data")
+def test_bad_files(tmp_path, name, text, message):
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        quietly(path)
+
+
+def test_bad_surfaces(tmp_path):
+    vertices, triangles = mobius()
+    path = write_obj(tmp_path / "band.obj", vertices, triangles.tolist())
+    with pytest.raises(ValueError, match=r"band\.obj: the surface has only one side"):
+        read(path)
+    fins = np.concatenate([cube_mesh().triangles, [[0, 1, 6]]])
+    path = write_obj(tmp_path / "fins.obj", cube_mesh().vertices, fins.tolist())
+    with pytest.raises(ValueError, match=r"fins.obj: \d edges are shared by more than two"):
+        read(path)
+    path = tmp_path / "tetra.vtu"
+    meshio.write(path, meshio.Mesh(np.eye(4, 3), [("tetra", [[0, 1, 2, 3]])]))
+    with pytest.raises(ValueError, match=r"tetra\.vtu: cells of type 'tetra'"):
+        read(path)
+
+
+def test_truncated_binary_files(tmp_path):
+    mesh = ball_mesh(100)
+    for kind, keep in (
+        ("ply", 1_500),
+        ("ply", 3_500),
+        ("stl", 5_000),
+        ("vtu", 900),
+        ("vtk", 2_000),
+    ):
+        path = tmp_path / f"whole.{kind}"
+        options = {"binary": True} if kind == "stl" else {}
+        cells = [("triangle", mesh.triangles.astype(np.int32))]
+        meshio.write(path, meshio.Mesh(mesh.vertices, cells), **options)
+        part = tmp_path / f"part.{kind}"
+        part.write_bytes(path.read_bytes()[:keep])
+        with pytest.raises(ValueError, match=rf"part.{kind}: (truncated|not readable)"):
+            quietly(part)
+
+
+def test_missing_file_and_missing_reader(tmp_path, monkeypatch):
+    with pytest.raises(OSError, match=r"none\.obj: no such file"):
+        read(tmp_path / "none.obj")
+    write(tmp_path / "a.vtu", ellipsoid(50))
+    monkeypatch.setitem(sys.modules, "meshio", None)
+    with pytest.raises(ImportError, match=r"pip install 'jaxsurf\[files\]'"):
+        read(tmp_path / "a.vtu")
+
+
+def test_a_list_of_points_is_not_resampled(tmp_path):
+    write(tmp_path / "a.xyz", ellipsoid(50))
+    with pytest.raises(ValueError, match=r"a\.xyz: a list of points without triangles"):
+        read(tmp_path / "a.xyz", n=20)
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "message"),
+    [
+        ("a.vtu", {"u": np.zeros(49)}, r"field 'u' has shape \(49,\), expected \(50, ...\)"),
+        ("a.vtu", {"u": np.zeros((50, 2, 3))}, r"tensor 'u' has shape \(50, 2, 3\)"),
+        ("a.vtu", {"u": np.zeros(50, complex)}, "field 'u' holds complex128"),
+        ("a.vtu", {"normals": np.zeros((50, 3))}, "the name 'normals' is taken"),
+        ("a.ply", {"my u": np.zeros(50)}, "PLY allows no blanks in names of fields: 'my u'"),
+        ("a.xyz", {"u": np.zeros(50)}, r"XYZ holds no fields \(u\)"),
+        ("a.stl", None, "unknown suffix '.stl'; written are"),
+    ],
+)
+def test_bad_writes(tmp_path, name, fields, message):
+    with pytest.raises(ValueError, match=message):
+        write(tmp_path / name, ellipsoid(50), fields)
+    assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize(("name", "n"), [("stanford-bunny.obj", 34_834), ("armadillo.obj", 43_243)])
+def test_real_files_as_they_are(name, n):
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        cloud = read(real(name))
+    text = " ".join(str(w.message) for w in record)
+    assert cloud.n == n
+    flat = np.asarray(quietly(real(name), smooth=False).normals)
+    agree = np.sum(np.asarray(cloud.normals) * flat, axis=1)
+    assert np.median(agree) > 0.995 and agree.min() > 0.8
+    if "bunny" in name:
+        assert "1113 vertices belong to no triangle" in text and cloud.boundary.sum() == 223
+    assert Path(name).stem in text

@@ -1,0 +1,148 @@
+import sys
+
+import matplotlib
+import numpy as np
+import pytest
+
+from jaxsurf import plot
+from jaxsurf.cloud import PointCloud
+from jaxsurf.plot import plot_cloud, plot_fields
+
+matplotlib.use("Agg")
+
+
+def sphere(n):
+    i = np.arange(n) + 0.5
+    z, angle = 1 - 2 * i / n, np.pi * (1 + 5**0.5) * i
+    r = np.sqrt(1 - z**2)
+    x = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+    return PointCloud(x, x)
+
+
+def circle(n):
+    angle = 2 * np.pi * np.arange(n) / n
+    x = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return PointCloud(x, x)
+
+
+@pytest.fixture(autouse=True)
+def _close_figures():
+    yield
+    matplotlib.pyplot.close("all")
+
+
+def picture(ax):
+    """The image drawn in the axes, upright, and its size in the units of the points."""
+    image = ax.images[0]
+    left, right, bottom, top = image.get_extent()
+    return np.asarray(image.get_array())[::-1], (right - left, top - bottom)
+
+
+@pytest.mark.parametrize("n", [300, 5_000])
+def test_sphere_is_a_closed_disk(n):
+    image, (width, height) = picture(plot_cloud(sphere(n), pixels=200))
+    covered = image[..., 3]
+    pixel = width * height / covered.size
+    assert abs(covered.sum() * pixel / np.pi - 1) < (0.09 if n < 1_000 else 0.02)
+    y, x = np.indices(covered.shape)
+    center = (np.array(covered.shape) - 1) / 2
+    inside = np.hypot(y - center[0], x - center[1]) * np.sqrt(pixel) < 0.97
+    assert (covered[inside] == 1).all()
+
+
+def test_light_comes_from_the_upper_left():
+    image, _ = picture(plot_cloud(sphere(3_000), pixels=200))
+    brightness = image[..., :3].sum(axis=-1)
+    h, w = brightness.shape
+    assert brightness[h // 4, w // 4] > 1.3 * brightness[3 * h // 4, 3 * w // 4]
+
+
+def test_colours_follow_the_field_and_the_view():
+    cloud = sphere(3_000)
+    image, _ = picture(plot_cloud(cloud, cloud.points[:, 2], pixels=200, view=(1, 0, 0)))
+    h, w, _ = image.shape
+    red, blue = image[..., 0], image[..., 2]
+    assert red[h // 8, w // 2] > 1.5 * blue[h // 8, w // 2]
+    assert blue[-h // 8, w // 2] > 1.5 * red[-h // 8, w // 2]
+    # From above, the northern half hides the southern one.
+    options = {"view": (0, 0, 1), "up": (0, 1, 0), "pixels": 200}
+    above, _ = picture(plot_cloud(cloud, cloud.points[:, 2], **options))
+    covered = above[..., 3] == 1
+    assert (above[..., 0] >= above[..., 2] - 0.08)[covered].all()
+
+
+def test_back_of_an_open_surface_is_drawn_darker():
+    ball = sphere(8_000)
+    upper = np.asarray(ball.points[:, 2]) > 0
+    x = ball.points[upper]
+    bowl = PointCloud(x, x, boundary=np.asarray(x[:, 2]) < 0.02)
+    outside, _ = picture(plot_cloud(bowl, pixels=150, view=(0, 0, 1), up=(0, 1, 0)))
+    inside, _ = picture(plot_cloud(bowl, pixels=150, view=(0, 0, -1), up=(0, 1, 0)))
+    h, w, _ = outside.shape
+    assert inside[h // 2, w // 2, 3] == outside[h // 2, w // 2, 3] == 1
+    assert inside[h // 2, w // 2, :3].sum() < 0.8 * outside[h // 2, w // 2, :3].sum()
+
+
+def test_points_that_are_off_are_not_drawn():
+    cloud = sphere(2_000)
+    left = np.asarray(cloud.points[:, 0]) < 0
+    half = PointCloud(cloud.points, cloud.normals, active=left)
+    _, (width, height) = picture(plot_cloud(half, pixels=100, view=(0, 1, 0)))
+    assert 0.4 < width / height < 0.65
+    with pytest.raises(ValueError, match="no point is switched on"):
+        plot_cloud(PointCloud(cloud.points, cloud.normals, active=np.zeros(2_000, bool)))
+
+
+@pytest.mark.parametrize(
+    ("values", "low", "high", "cmap", "extend"),
+    [
+        (np.linspace(-1, 3, 1_000), -3, 3, "coolwarm", "neither"),
+        (np.linspace(1, 3, 1_000), 1, 3, "viridis", "neither"),
+        (np.append(np.linspace(-1, 1, 999), 50), -1, 1, "coolwarm", "max"),
+        (np.full(1_000, 2.0), 1, 3, "viridis", "neither"),
+        (np.zeros(1_000), -0.5, 0.5, "coolwarm", "neither"),
+    ],
+)
+def test_colour_map_and_limits(values, low, high, cmap, extend):
+    colors = plot._Colors.of(values, None, None)
+    assert np.allclose([colors.low, colors.high], [low, high], atol=0.02)
+    assert colors.extend == extend
+    if values.any():
+        assert colors.cmap == cmap
+
+
+def test_curve_and_colour_bar():
+    cloud = circle(50)
+    ax = plot_cloud(cloud, cloud.points[:, 0], label="temperature", title="ring")
+    assert len(ax.collections[0].get_segments()) == 50
+    assert ax.get_title() == "ring"
+    assert ax.figure.axes[1].get_ylabel() == "temperature"
+
+
+def test_panels_are_written(tmp_path):
+    cloud, path = sphere(800), tmp_path / "panels.png"
+    fields = {"shape": None, "x": cloud.points[:, 0], "y": cloud.points[:, 1]}
+    figure = plot_fields(cloud, fields, path=path, columns=2, pixels=150, dpi=50)
+    assert [ax.get_title() for ax in figure.axes if ax.get_title()] == ["shape", "x", "y"]
+    image = matplotlib.image.imread(path)
+    assert image.shape[0] > 200
+    assert 0.05 < (image[..., :3].min(axis=-1) < 0.9).mean() < 0.9
+    assert not matplotlib.pyplot.get_fignums()
+
+
+def test_bad_input():
+    cloud = sphere(100)
+    with pytest.raises(ValueError, match=r"field has shape \(99,\), expected \(100,\)"):
+        plot_cloud(cloud, np.zeros(99))
+    with pytest.raises(ValueError, match="field is nan at point 7"):
+        plot_cloud(cloud, np.where(np.arange(100) == 7, np.nan, 0))
+    with pytest.raises(ValueError, match="which way is up"):
+        plot_cloud(cloud, view=(0, 0, 2))
+    with pytest.raises(ValueError, match="no fields to draw"):
+        plot_fields(cloud, {})
+
+
+def test_without_matplotlib(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ImportError, match=r"pip install 'jaxsurf\[pictures\]'"):
+        plot_cloud(sphere(100))

@@ -296,11 +296,11 @@ def _contents(mesh) -> Contents:
     # VTK files are big-endian.
     data = {k: _native(np.asarray(v)) for k, v in mesh.point_data.items()}
     normals = None
-    if {"nx", "ny", "nz"} <= data.keys():
-        normals = np.stack([data.pop(k) for k in ("nx", "ny", "nz")], axis=1).astype(float)
     for name in ("normals", "Normals"):
         if normals is None and name in data and data[name].shape == points.shape:
             normals = data.pop(name).astype(float)
+    if normals is None and {"nx", "ny", "nz"} <= data.keys():
+        normals = np.stack([data.pop(k) for k in ("nx", "ny", "nz")], axis=1).astype(float)
     return Contents(points, faces, normals, data, notes)
 
 

@@ -246,9 +246,12 @@ def write(
         names = "x y nx ny" if cloud.dim == 2 else "x y z nx ny nz"
         np.savetxt(path, np.hstack([points, normals]), fmt="%.17g", header=names)
         return
+    taken = ["normals", *_OWN]
+    if suffix == ".ply":
+        taken += ["x", "y", "z", "nx", "ny", "nz"]
     data = {"normals": _in_space("normals", normals, cloud)}
     for name, value in (fields or {}).items():
-        if name in ("normals", "nx", "ny", "nz", "x", "y", "z", *_OWN):
+        if name in taken:
             raise ValueError(f"the name {name!r} is taken by the cloud itself")
         data[name] = _in_space(name, np.asarray(value), cloud)
     for name in _OWN:

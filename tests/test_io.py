@@ -359,6 +359,7 @@ def test_a_list_of_points_is_not_resampled(tmp_path):
         ("a.vtu", {"u": np.zeros((50, 2, 3))}, r"tensor 'u' has shape \(50, 2, 3\)"),
         ("a.vtu", {"u": np.zeros(50, complex)}, "field 'u' holds complex128"),
         ("a.vtu", {"normals": np.zeros((50, 3))}, "the name 'normals' is taken"),
+        ("a.ply", {"x": np.zeros(50)}, "the name 'x' is taken"),
         ("a.ply", {"my u": np.zeros(50)}, "PLY allows no blanks in names of fields: 'my u'"),
         ("a.xyz", {"u": np.zeros(50)}, r"XYZ holds no fields \(u\)"),
         ("a.stl", None, "unknown suffix '.stl'; written are"),

@@ -68,7 +68,8 @@ def from_points(
         points: n points in d = 2 or 3 dimensions, concrete.
         degree: polynomial degree of the local fits; that of the operators to be used.
         boundary: True for points on a border of the surface, `(n,)`.
-        k: number of neighbours in a fit; three times the number of its coefficients if None.
+        k: number of neighbours in a fit; two (curves) or three (surfaces) times
+            the number of its coefficients if None.
 
     Returns:
         The points, in the order given, with the normals from `estimate_normals`.
@@ -103,8 +104,8 @@ def estimate_normals(
     Args:
         points: n points in d = 2 or 3 dimensions, concrete.
         degree: polynomial degree of the fits.
-        k: number of neighbours in a fit, the point included; three times the number
-            of coefficients if None.
+        k: number of neighbours in a fit, the point included; two (curves) or three
+            (surfaces) times the number of coefficients if None.
         iterations: most repetitions of the fit at a point; it stops when nothing changes.
         orient: choose the signs; if False, each is arbitrary and neighbours on the
             other side of a thin part cannot be told apart.
@@ -141,7 +142,8 @@ def estimate_normals(
     x = np.asarray(points)
     raise_at(~np.isfinite(x).all(axis=1), "point {i} is not finite: {v}", x)
     needed = len(_exponents(dim - 1, degree)) + 1
-    k = 3 * needed if k is None else k
+    if k is None:
+        k = 3 * needed if dim == 3 else 2 * needed + 1
     _check_fit(k, degree, needed)
     check_count(k, n)
     tree = cKDTree(x.astype(float))
@@ -303,8 +305,8 @@ def _refit(points, i, normals, slots, mask, radius, degree, iterations, batch_si
             new = normal - slope[: len(frame) - 1] @ frame[:-1]
             return new / jnp.linalg.norm(new), pivot
 
-        normal, pivot = jax.lax.scan(step, normal, length=iterations)
-        return normal, pivot[-1]
+        fitted, pivot = jax.lax.scan(step, normal, length=iterations)
+        return jnp.where(mask[0], fitted, normal), pivot[-1]
 
     return jax.lax.map(
         lambda a: row(*a), (i, normals, slots, mask, radius), batch_size=min(batch_size, len(i))

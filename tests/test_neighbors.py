@@ -259,9 +259,9 @@ def test_misuse_is_refused():
         find_neighbors(cloud, 101)
     with pytest.raises(ValueError, match="too few points: 40, with k = 50"):
         find_neighbors(PointCloud(x, x, active=np.arange(100) < 40), 50)
-    with pytest.raises(ValueError, match="radius of point 0 is -1.0"):
+    with pytest.raises(ValueError, match=r"radius of point 0 is -1\.0"):
         find_neighbors(cloud, radius=-1.0)
-    with pytest.raises(ValueError, match="radius of point 0 is 0.0"):
+    with pytest.raises(ValueError, match=r"radius of point 0 is 0\.0"):
         find_neighbors(cloud, radius=0.0)
     with pytest.raises(ValueError, match="capacity belongs"):
         find_neighbors(cloud, 5, capacity=6)
@@ -341,7 +341,7 @@ def test_concentric_spheres(gap):
 def test_sheets_too_close_are_refused(gap):
     for shift in [(0.0, 0.0), (0.5, 0.5), (0.3, 0.1)]:
         x, normals = plates(gap, shift)
-        with pytest.raises(ValueError, match="too close to be told apart|mixed orientation"):
+        with pytest.raises(ValueError, match=r"too close to be told apart|mixed orientation"):
             find_neighbors(PointCloud(x, normals), 20)
 
 

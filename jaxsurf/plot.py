@@ -242,7 +242,7 @@ class _Colors(NamedTuple):
 def _limits(values) -> tuple[float, float]:
     low, high = float(values.min()), float(values.max())
     inner_low, inner_high = map(float, np.quantile(values, [0.005, 0.995]))
-    far = 0.75 * (inner_high - inner_low)
+    far = 0.25 * (inner_high - inner_low)
     if far == 0:
         return low, high
     return (

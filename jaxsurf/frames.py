@@ -308,9 +308,15 @@ def _refit(points, i, normals, slots, mask, radius, degree, iterations, batch_si
         fitted, pivot = jax.lax.scan(step, normal, length=iterations)
         return jnp.where(mask[0], fitted, normal), pivot[-1]
 
-    return jax.lax.map(
-        lambda a: row(*a), (i, normals, slots, mask, radius), batch_size=min(batch_size, len(i))
+    # Whole blocks only: an incomplete one would be compiled a second time.
+    batch = min(batch_size, len(i))
+    which = jnp.arange(-(-len(i) // batch) * batch) % len(i)
+    results = jax.lax.map(
+        lambda r: row(*jax.tree.map(lambda a: a[r], (i, normals, slots, mask, radius))),
+        which,
+        batch_size=batch,
     )
+    return jax.tree.map(lambda a: a[: len(i)], results)
 
 
 def _reach(squared: Float[Array, " k"], mask: Bool[Array, " k"]) -> Float[Array, ""]:

@@ -11,6 +11,8 @@ from .neighbors import check_orientation
 
 # Neighbours used for the first guess: one ring and a half, so that thin parts stay apart.
 _NEAR = {2: 5, 3: 13}
+# Sheets with fewer points than this are scraps of another.
+_SCRAP = 50
 # Edges steeper than this against the surface lead to another sheet.
 _STEEP = 0.7
 
@@ -58,7 +60,9 @@ def orient_normals(points: np.ndarray, normals: np.ndarray, tree: cKDTree) -> np
     agreement, steep = _compare(points, normals, i, j)
     sign = _spread(n, i, j, np.where(agreement < 0, -1, 1))
     normals = normals * sign[:, None]
-    return normals * _outward(points, normals, _sheets(n, i, j, steep), tree)[:, None]
+    area = tree.query(points, [count], workers=-1)[0][:, 0] ** (dim - 1)
+    sheet = _sheets(area[:, None] * normals, i, j, steep)
+    return normals * _outward(points, normals, area, sheet)[:, None]
 
 
 def check_one_sided(points: np.ndarray, normals: np.ndarray, tree: cKDTree) -> None:
@@ -108,34 +112,45 @@ def _spread(n: int, i, j, flip) -> np.ndarray:
     return sign[:n]
 
 
-def _sheets(n: int, i, j, steep) -> np.ndarray:
-    """Label of the surface that each point belongs to: trees without their steep edges."""
+def _sheets(area_vectors, i, j, steep) -> np.ndarray:
+    """Label of the surface that each point belongs to, from the tree edges (i, j).
+
+    Steep edges lead to another sheet. A closed one is a surface of its own; open ones, as
+    the two sides of a plate without a rim, keep the signs that they have to each other.
+    """
+    n = len(area_vectors)
     flat = steep < _STEEP
     _, label = connected_components(_symmetric(i[flat], j[flat], np.ones(flat.sum()), n), False)
+    i, j = i[~flat], j[~flat]
     size = np.bincount(label)
     # A scrap, as at a sharp tip, follows the sheet it hangs on.
     while True:
         a, b = label[i], label[j]
-        scrap = (a != b) & (np.minimum(size[a], size[b]) < 50)
-        if not scrap.any():
-            return label
-        e = np.flatnonzero(scrap)[0]
-        small, large = (a[e], b[e]) if size[a[e]] < size[b[e]] else (b[e], a[e])
+        scrap = np.flatnonzero((a != b) & (np.minimum(size[a], size[b]) < _SCRAP))
+        if not scrap.size:
+            break
+        small, large = sorted((a[scrap[0]], b[scrap[0]]), key=lambda piece: size[piece])
         label[label == small] = large
         size[large] += size[small]
         size[small] = 0
+    # The area vectors of a closed surface add up to nothing.
+    total = np.stack([np.bincount(label, c, len(size)) for c in area_vectors.T], axis=1)
+    area = np.bincount(label, np.linalg.norm(area_vectors, axis=1), len(size))
+    is_open = np.linalg.norm(total, axis=1) > 0.1 * area
+    both = is_open[label[i]] & is_open[label[j]]
+    links = _symmetric(label[i[both]], label[j[both]], np.ones(both.sum()), len(size))
+    return connected_components(links, directed=False)[1][label]
 
 
-def _outward(points, normals, label, tree: cKDTree) -> np.ndarray:
+def _outward(points, normals, area, label) -> np.ndarray:
     """Sign per point that makes the enclosed volume of each surface positive."""
-    dim = points.shape[1]
-    area = tree.query(points, [min(len(points), _NEAR[dim])], workers=-1)[0][:, 0] ** (dim - 1)
     size = np.maximum(np.bincount(label), 1)
     centre = np.stack([np.bincount(label, c) / size for c in points.T], axis=1)
     flux = area * np.einsum("nd,nd->n", points - centre[label], normals)
     total, scale = np.bincount(label, flux), np.bincount(label, np.abs(flux))
+    reach = np.bincount(label, area * np.linalg.norm(points - centre[label], axis=1))
     # An open flat sheet encloses nothing: its first normal component that counts is positive.
     mean = np.stack([np.bincount(label, c) / size for c in normals.T], axis=1)
     leading = mean[np.arange(len(mean)), np.argmax(np.abs(mean).round(6), axis=1)]
-    flat = np.abs(total) <= 1e-6 * scale.max(initial=0)
+    flat = scale <= 1e-6 * reach
     return np.where(np.where(flat, leading, total) < 0, -1, 1)[label]

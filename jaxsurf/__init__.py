@@ -3,16 +3,22 @@
 Points, then neighbours, then stencils, then operators: `import jaxsurf as js`.
 """
 
+from .cells import SearchCapacity as SearchCapacity
+from .cells import allocate as allocate
+from .cells import search_neighbors as search_neighbors
+from .cloud import PointCloud as PointCloud
 from .curvature import gauss_curvature as gauss_curvature
 from .curvature import mean_curvature as mean_curvature
 from .curvature import mean_curvature_vector as mean_curvature_vector
 from .curvature import principal_curvatures as principal_curvatures
 from .curvature import shape_tensor as shape_tensor
-from .cells import SearchCapacity as SearchCapacity
-from .cells import allocate as allocate
-from .cells import search_neighbors as search_neighbors
-from .cloud import PointCloud as PointCloud
+from .frames import estimate_normals as estimate_normals
+from .frames import from_points as from_points
+from .frames import refit_normals as refit_normals
 from .frames import tangent_frames as tangent_frames
+from .io import read as read
+from .io import read_fields as read_fields
+from .io import write as write
 from .neighbors import Neighbors as Neighbors
 from .neighbors import find_neighbors as find_neighbors
 from .neighbors import tube_ratio as tube_ratio
@@ -24,6 +30,8 @@ from .operators import laplace_beltrami as laplace_beltrami
 from .operators import partial_derivative as partial_derivative
 from .operators import surface_divergence as surface_divergence
 from .operators import surface_gradient as surface_gradient
+from .plot import plot_cloud as plot_cloud
+from .plot import plot_fields as plot_fields
 from .shapes.analytic import circle as circle
 from .shapes.analytic import ellipsoid as ellipsoid
 from .shapes.analytic import graph as graph
@@ -35,7 +43,12 @@ from .shapes.implicit import level_set as level_set
 from .shapes.implicit import level_set_curvature as level_set_curvature
 from .shapes.implicit import level_set_normals as level_set_normals
 from .shapes.implicit import project_to_level_set as project_to_level_set
+from .shapes.meshes import TriangleMesh as TriangleMesh
+from .shapes.meshes import clean_mesh as clean_mesh
+from .shapes.meshes import sample_mesh as sample_mesh
 from .shapes.order import sort_cloud as sort_cloud
+from .shapes.sampling import jitter as jitter
+from .shapes.sampling import poisson_disk as poisson_disk
 from .stencils.dcpse import DCPSE as DCPSE
 from .stencils.dcpse import FlatDCPSE as FlatDCPSE
 from .stencils.gfdm import GFDM as GFDM

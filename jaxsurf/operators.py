@@ -13,10 +13,10 @@ from jaxtyping import Array, Float
 from .cloud import PointCloud, is_concrete
 from .neighbors import Neighbors, find_neighbors
 from .stencils.dcpse import DCPSE, FlatDCPSE
-from .stencils.method import AbstractMethod, Diagnostics, Neighborhood
+from .stencils.method import AbstractMethod, Neighborhood
 from .stencils.moments import blockwise
 from .stencils.stencil import Composition, Stencil
-from .stencils.targets import AbstractTarget, Gradient, Hessian, Laplacian, Partial
+from .stencils.targets import Gradient, Hessian, Laplacian, Partial
 
 
 def laplace_beltrami(
@@ -281,7 +281,9 @@ def partial_derivative(
     cloud = PointCloud(points, normals)
     target = Partial(tuple(alpha))
     if neighbors is None:
-        neighbors = find_neighbors(cloud, min(method.neighbor_count(dim, target), len(points)), throw=False)
+        neighbors = find_neighbors(
+            cloud, min(method.neighbor_count(dim, target), len(points)), throw=False
+        )
     return _build(cloud, neighbors, method, target, throw)
 
 
@@ -411,7 +413,8 @@ def _check_sizes(cloud, neighbors, method, target, throw) -> None:
 
 
 def _check(stencil: Stencil, neighbors, method, target, dim) -> None:
-    diagnostics: Diagnostics = stencil.diagnostics
+    diagnostics = stencil.diagnostics
+    assert diagnostics is not None
     on = np.asarray(neighbors.mask[:, 0])
     count, residual = np.asarray(diagnostics.count), np.asarray(diagnostics.residual)
     bad = np.flatnonzero(on & ~(residual < _tolerance(residual.dtype)))

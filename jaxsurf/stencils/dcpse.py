@@ -79,7 +79,9 @@ class DCPSE(AbstractMethod):
         eta, condition, residual = _kernel(copies, on, width, radius, target, self.order)
         eta = jnp.sum(eta.reshape(-1, k, 2 * count + 1), axis=2)
         diagnostics = Diagnostics.of(neighborhood, condition, residual, radius, count)
-        return target.assemble(_with_center(eta, target.order), jnp.eye(dim, dtype=eta.dtype)), diagnostics
+        return target.assemble(
+            _with_center(eta, target.order), jnp.eye(dim, dtype=eta.dtype)
+        ), diagnostics
 
 
 class FlatDCPSE(AbstractMethod):

@@ -84,4 +84,6 @@ def check_positive(method: AbstractMethod, *names: str) -> None:
     for name in names:
         value = getattr(method, name)
         if value is not None and not value > 0:
-            raise ValueError(f"{type(method).__name__}: {name} = {value}, expected a positive number")
+            raise ValueError(
+                f"{type(method).__name__}: {name} = {value}, expected a positive number"
+            )

@@ -99,7 +99,7 @@ class Stencil(AbstractOperator):
         split = u.ndim - len(self.in_shape)
         if split < 1 or u.shape[0] != self.n or u.shape[split:] != self.in_shape:
             raise ValueError(
-                f"field has shape {u.shape}, expected ({self.n}, ..., {self.in_shape})"
+                f"field has shape {u.shape}, expected ({self.n}, ...) and components {self.in_shape}"
             )
         batch = u.shape[1:split]
         columns = jnp.moveaxis(u.reshape(self.n, -1, q), 0, -1)
@@ -153,16 +153,16 @@ class Stencil(AbstractOperator):
 
     def save(self, path: str | Path) -> None:
         """Write indices and weights to a NumPy archive (`.npz`, no pickle)."""
-        extra = {} if self.diagnostics is None else _arrays(self.diagnostics)
+        data = {
+            "indices": np.asarray(self.indices),
+            "weights": np.asarray(self.weights),
+            "out_shape": np.array(self.out_shape, int),
+            "in_shape": np.array(self.in_shape, int),
+        }
+        if self.diagnostics is not None:
+            data |= {name: np.asarray(value) for name, value in vars(self.diagnostics).items()}
         with open(path, "wb") as file:
-            np.savez(
-                file,
-                indices=np.asarray(self.indices),
-                weights=np.asarray(self.weights),
-                out_shape=np.array(self.out_shape, int),
-                in_shape=np.array(self.in_shape, int),
-                **extra,
-            )
+            np.savez(file, allow_pickle=False, **data)
 
     @classmethod
     def load(cls, path: str | Path) -> Stencil:
@@ -174,12 +174,15 @@ class Stencil(AbstractOperator):
         try:
             archive = np.load(path, allow_pickle=False)
             data = {name: archive[name] for name in archive.files}
-            shapes = [tuple(data.pop(name).tolist()) for name in ("out_shape", "in_shape")]
+            out_shape, in_shape = (
+                tuple(data.pop(name).tolist()) for name in ("out_shape", "in_shape")
+            )
             indices, weights = jnp.asarray(data.pop("indices")), jnp.asarray(data.pop("weights"))
         except (OSError, EOFError, KeyError, ValueError, AttributeError) as error:
             raise ValueError(f"{path} does not hold a stencil: {error}") from error
         extra = {name: jnp.asarray(value) for name, value in data.items()}
-        return cls(indices, weights, *shapes, Diagnostics(**extra) if extra else None)
+        diagnostics = Diagnostics(**extra) if extra else None
+        return cls(indices, weights, out_shape, in_shape, diagnostics)
 
 
 class Composition(AbstractOperator):
@@ -214,10 +217,6 @@ class Composition(AbstractOperator):
 
     def to_scipy(self):
         return self.outer.to_scipy() @ self.inner.to_scipy()
-
-
-def _arrays(module: eqx.Module) -> dict[str, np.ndarray]:
-    return {name: np.asarray(value) for name, value in vars(module).items()}
 
 
 def _incoming(indices: np.ndarray):

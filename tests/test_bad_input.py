@@ -1,0 +1,117 @@
+"""Misuse and degenerate points: named, with the number there was and the number needed."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsurf as js
+
+from .helpers import METHODS, label
+
+SPHERE = js.sphere(300)
+
+
+def changed(values, i, new):
+    values = np.array(values)
+    values[i] = new
+    return values
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_points_that_are_not_finite(bad):
+    with pytest.raises(ValueError, match="point 7 is not finite"):
+        js.PointCloud(changed(SPHERE.points, (7, 1), bad), SPHERE.normals)
+    with pytest.raises(ValueError, match="normal 7 has length"):
+        js.PointCloud(SPHERE.points, changed(SPHERE.normals, (7, 1), bad))
+
+
+@pytest.mark.parametrize("length", [0.0, 0.99, 2.0])
+def test_normals_of_the_wrong_length(length):
+    normals = changed(SPHERE.normals, 4, length * np.asarray(SPHERE.normals[4]))
+    with pytest.raises(ValueError, match=rf"normal 4 has length {length}.*expected 1"):
+        js.PointCloud(SPHERE.points, normals)
+
+
+def test_wrong_shapes():
+    with pytest.raises(ValueError, match=r"\(n, 2\) or \(n, 3\), not \(5, 4\)"):
+        js.PointCloud(np.ones((5, 4)), np.ones((5, 4)))
+    with pytest.raises(ValueError, match=r"normals have shape \(299, 3\), points \(300, 3\)"):
+        js.PointCloud(SPHERE.points, SPHERE.normals[1:])
+    with pytest.raises(ValueError, match=r"spacing has shape \(2,\)"):
+        js.PointCloud(SPHERE.points, SPHERE.normals, spacing=np.ones(2))
+    with pytest.raises(ValueError, match=r"spacing of point 3 is -1\.0"):
+        js.PointCloud(SPHERE.points, SPHERE.normals, spacing=changed(np.ones(300), 3, -1))
+
+
+def test_duplicates():
+    points = changed(SPHERE.points, 20, SPHERE.points[100])
+    cloud = js.PointCloud(points, changed(SPHERE.normals, 20, SPHERE.normals[100]))
+    with pytest.raises(ValueError, match="points 20 and 100 coincide"):
+        js.laplace_beltrami(cloud)
+
+
+def test_mixed_orientation():
+    cloud = js.PointCloud(SPHERE.points, changed(SPHERE.normals, 9, -SPHERE.normals[9]))
+    with pytest.raises(ValueError, match="mixed orientation"):
+        js.laplace_beltrami(cloud)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=label)
+def test_too_few_neighbors(method):
+    neighbors = js.find_neighbors(SPHERE, k=6 if label(method).endswith("4") else 5)
+    need = {"DCPSE2": 10, "DCPSE4": 21, "GFDM2": 6, "GFDM4": 15}[label(method)]
+    with pytest.raises(
+        ValueError, match=rf"k = \d neighbours, {type(method).__name__}.*least {need}"
+    ):
+        js.laplace_beltrami(SPHERE, neighbors, method=method)
+
+
+def test_too_few_points():
+    with pytest.raises(ValueError, match=r"k = 12 neighbours, GFDM\(degree=4\) needs at least 15"):
+        small = js.sphere(12)
+        js.laplace_beltrami(small, js.find_neighbors(small, k=12, throw=False), method=js.GFDM(4))
+
+
+@pytest.mark.parametrize("method", METHODS, ids=label)
+def test_points_on_a_line(method):
+    x = jnp.linspace(0, 1, 100)
+    points = jnp.stack([x, 0 * x, 0 * x], axis=1)
+    cloud = js.PointCloud(points, jnp.tile(jnp.array([0.0, 0.0, 1.0]), (100, 1)))
+    neighbors = js.find_neighbors(cloud, k=method.neighbor_count(3))
+    with pytest.raises(ValueError, match=r"degenerate stencil at point \d+: relative moment"):
+        js.laplace_beltrami(cloud, neighbors, method=method)
+    operator = js.laplace_beltrami(cloud, neighbors, method=method, throw=False)
+    assert operator.diagnostics.residual.min() > 1e-3
+    assert jnp.isfinite(operator.diagnostics.residual).all()
+
+
+def test_one_point_whose_support_is_too_small():
+    """A masked row names the point, the number it has and the number needed."""
+    neighbors = js.find_neighbors(SPHERE, k=30)
+    poor = js.Neighbors(neighbors.indices, neighbors.mask.at[42, 5:].set(False))
+    with pytest.raises(ValueError, match=r"point 42: .* with \d points within .* at least 10"):
+        js.laplace_beltrami(SPHERE, poor)
+
+
+def test_a_surface_that_bends_within_one_stencil():
+    cloud = js.torus(200, 1.0, 0.25)
+    with pytest.warns(UserWarning, match="bends within one stencil: support x curvature"):
+        js.laplace_beltrami(cloud, js.find_neighbors(cloud, k=30, throw=False))
+
+
+def test_neighbors_of_another_cloud():
+    with pytest.raises(ValueError, match="neighbours of 300 points, the cloud has 200"):
+        js.laplace_beltrami(js.sphere(200), js.find_neighbors(SPHERE, k=30))
+
+
+def test_settings_that_make_no_sense():
+    with pytest.raises(ValueError, match="DCPSE: order = 0"):
+        js.DCPSE(order=0)
+    with pytest.raises(ValueError, match="DCPSE: layer_spacing = -1"):
+        js.DCPSE(layer_spacing=-1)
+    with pytest.raises(ValueError, match="GFDM: degree = 0"):
+        js.GFDM(degree=0)
+    with pytest.raises(ValueError, match="diffusivity has shape"):
+        js.diffusion(SPHERE, jnp.ones((300, 2)))
+    with pytest.raises(ValueError, match="direction has shape"):
+        js.directional_derivative(SPHERE, jnp.ones((300, 2)))

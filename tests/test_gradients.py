@@ -1,0 +1,170 @@
+"""Every operator and curvature against central differences: points, normals, fields."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsurf as js
+
+from .helpers import METHODS, check_derivative, jittered_sphere, label
+
+CLOUD = jittered_sphere(300, seed=1)
+FIELD = jnp.sin(CLOUD.points @ jnp.array([1.0, 2.0, 1.5]))
+VECTOR = jnp.stack([FIELD, FIELD**2, jnp.cos(FIELD)], axis=1)
+each_method = pytest.mark.parametrize("method", METHODS, ids=label)
+
+
+def smooth(values):
+    """A scalar that weighs all entries differently."""
+    weights = jnp.cos(jnp.arange(values.size, dtype=values.dtype)).reshape(values.shape)
+    return jnp.sum(weights * values) / 100
+
+
+def cloud_of(points):
+    """Points near the sphere with the normals of the sphere through each: both depend on them."""
+    return js.PointCloud(points, points / jnp.linalg.norm(points, axis=1, keepdims=True))
+
+
+def outputs(cloud, neighbors, method):
+    args = dict(neighbors=neighbors, method=method)
+    yield js.laplace_beltrami(cloud, **args)(FIELD)
+    yield js.surface_gradient(cloud, **args)(FIELD)
+    yield js.surface_divergence(cloud, **args)(VECTOR)
+    yield js.directional_derivative(cloud, VECTOR, **args)(FIELD)
+    yield js.diffusion(cloud, VECTOR[:, :, None] * VECTOR[:, None], **args)(FIELD)
+    yield js.mean_curvature(cloud, **args)
+    yield js.gauss_curvature(cloud, **args)
+    yield js.principal_curvatures(cloud, **args)[0]
+    yield js.mean_curvature_vector(cloud, **args)
+
+
+@each_method
+def test_everything_in_points_and_normals(method):
+    neighbors = js.choose_neighbors(CLOUD, method=method)
+
+    def total(points):
+        return sum(smooth(v) for v in outputs(cloud_of(points), neighbors, method))
+
+    # Off the sphere, so that the principal curvatures differ.
+    check_derivative(total, CLOUD.points * jnp.array([1.0, 1.2, 1.5]), step=1e-4)
+
+
+@each_method
+def test_normals_alone(method):
+    neighbors = js.choose_neighbors(CLOUD, method=method)
+
+    def total(normals):
+        return smooth(
+            js.laplace_beltrami(js.PointCloud(CLOUD.points, normals), neighbors, method=method)(
+                FIELD
+            )
+        )
+
+    check_derivative(total, CLOUD.normals, step=1e-4)
+
+
+def test_field_and_coefficients():
+    neighbors = js.choose_neighbors(CLOUD)
+    laplacian = js.laplace_beltrami(CLOUD, neighbors)
+    gradient = js.surface_gradient(CLOUD, neighbors)
+    check_derivative(lambda u: smooth(laplacian(u) ** 2) + smooth(gradient(u) ** 2), FIELD)
+    check_derivative(
+        lambda d: smooth(js.diffusion(CLOUD, d, neighbors=neighbors)(FIELD) ** 2), 1.5 + FIELD
+    )
+    check_derivative(
+        lambda a: smooth(js.directional_derivative(CLOUD, a, neighbors=neighbors)(FIELD) ** 2),
+        VECTOR,
+    )
+    check_derivative(lambda s: smooth(laplacian.scaled(s).transpose()(FIELD)), 1.0 + FIELD**2)
+
+
+@each_method
+def test_a_neighbor_crosses_the_edge_of_the_support(method):
+    """A search by radius: the lists change within the difference, the weights must not jump."""
+    radius = 0.62 if label(method).endswith("4") else 0.5
+    points = np.array(CLOUD.points)
+    others = np.linalg.norm(points - points[0], axis=1)
+    j = int(np.argmin(np.where(others > 0.8 * radius, others, np.inf)))
+    direction = (points[j] - points[0]) / others[j]
+    start = points[j] + (radius - others[j]) * direction
+
+    def value(step, search_at=None):
+        moved = jnp.asarray(points).at[j].set(jnp.asarray(start) + step * direction)
+        cloud = js.PointCloud(moved, CLOUD.normals)
+        where = cloud if search_at is None else search_at
+        neighbors = js.find_neighbors(where, radius=radius, throw=False)
+        return smooth(js.laplace_beltrami(cloud, neighbors, method=method)(FIELD))
+
+    at_edge = js.PointCloud(jnp.asarray(points).at[j].set(start), CLOUD.normals)
+    derivative = jax.grad(lambda s: value(s, at_edge))(0.0)
+    h = 1e-5
+    inside = js.find_neighbors(
+        at_edge.__class__(at_edge.points.at[j].set(start - h * direction), CLOUD.normals),
+        radius=radius,
+        throw=False,
+    )
+    assert int(inside.mask[0].sum()) > 0 and bool((inside.indices[0] == j).any())
+    difference = (float(value(h)) - float(value(-h))) / (2 * h)
+    np.testing.assert_allclose(derivative, difference, rtol=1e-6)
+
+
+@each_method
+def test_the_nearest_change(method):
+    """The k nearest: a point that enters the list has no weight yet."""
+    k = method.neighbor_count(3)
+    points = np.array(CLOUD.points)
+    order = np.argsort(np.linalg.norm(points - points[0], axis=1))
+    inner, outer = order[k - 1], order[k]
+    target = np.linalg.norm(points[outer] - points[0])
+    direction = (points[inner] - points[0]) / np.linalg.norm(points[inner] - points[0])
+
+    def row(distance):
+        moved = points.copy()
+        moved[inner] = points[0] + distance * direction
+        cloud = js.PointCloud(moved, CLOUD.normals)
+        neighbors = js.find_neighbors(cloud, k=k, throw=False)
+        operator = js.laplace_beltrami(cloud, neighbors, method=method, throw=False)
+        return bool((neighbors.indices[0] == inner).any()), float(operator(FIELD)[0])
+
+    (listed, before), (gone, after) = row(target * (1 - 1e-9)), row(target * (1 + 1e-9))
+    assert listed and not gone
+    np.testing.assert_allclose(before, after, rtol=1e-6)
+
+
+def test_padded_and_switched_off_rows_have_finite_gradients():
+    keep = np.arange(CLOUD.n) % 10 != 0
+    cloud = js.PointCloud(CLOUD.points, CLOUD.normals, active=keep)
+    for method in METHODS:
+        neighbors = js.choose_neighbors(cloud, method=method)
+
+        def total(points, neighbors=neighbors, method=method):
+            cloud = js.PointCloud(points, CLOUD.normals, active=keep)
+            return smooth(js.laplace_beltrami(cloud, neighbors, method=method)(FIELD))
+
+        gradient = jax.jit(jax.grad(total))(CLOUD.points)
+        assert jnp.isfinite(gradient).all()
+        assert jnp.abs(gradient[~keep]).max() == 0 < jnp.abs(gradient[keep]).max()
+
+
+def test_gradient_under_vmap():
+    neighbors = js.choose_neighbors(CLOUD)
+
+    def total(scale):
+        return smooth(js.laplace_beltrami(cloud_of(scale * CLOUD.points), neighbors)(FIELD))
+
+    scales = jnp.array([0.9, 1.0, 1.3])
+    batch = jax.vmap(jax.grad(total))(scales)
+    # total is proportional to scale^-2
+    np.testing.assert_allclose(batch, -2 * jax.vmap(total)(scales) / scales, rtol=1e-8)
+
+
+def test_gradient_through_estimated_normals():
+    neighbors = js.choose_neighbors(CLOUD, method=js.GFDM(degree=4))
+
+    def total(points):
+        normals = js.refit_normals(points, CLOUD.normals, neighbors, degree=4)
+        cloud = js.PointCloud(points, normals)
+        return smooth(js.laplace_beltrami(cloud, neighbors, method=js.GFDM(degree=4))(FIELD))
+
+    check_derivative(total, CLOUD.points, step=1e-5)

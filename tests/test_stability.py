@@ -1,0 +1,45 @@
+"""Spectra of the default Laplacians: no eigenvalue with positive real part beyond round-off."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import jaxsurf as js
+
+from .helpers import METHODS, jittered_sphere, label, random_sphere
+
+CLOUDS = {
+    "fibonacci": js.sphere(800),
+    "jittered": jittered_sphere(800),
+    "random": random_sphere(800),
+    "torus": js.torus(800, 1.0, 0.5),
+}
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+@pytest.mark.parametrize("method", METHODS, ids=label)
+def test_spectrum(name, method):
+    operator = js.laplace_beltrami(CLOUDS[name], method=method)
+    values = scipy.linalg.eigvals(operator.to_scipy().toarray())
+    assert values.real.max() < 1e-8 * np.abs(values).max()
+    # One constant in the kernel, and on the sphere the first eigenvalue -2, three times.
+    if name != "torus":
+        lowest = np.sort(np.abs(values))[:4]
+        assert lowest[0] < 1e-9
+        np.testing.assert_allclose(lowest[1:], 2, rtol=0.1)
+
+
+def test_irregular_points_get_larger_neighborhoods():
+    method = js.GFDM(degree=2)
+    even = js.choose_neighbors(CLOUDS["fibonacci"], method=method)
+    random = js.choose_neighbors(CLOUDS["random"], method=method)
+    assert even.k == method.neighbor_count(3) < random.k
+    counts = np.asarray(random.mask.sum(axis=1))
+    assert 0.8 < np.mean(counts == method.neighbor_count(3)) < 1
+    adapted = js.laplace_beltrami(CLOUDS["random"], random, method=method).weights
+    assert jnp.all(-adapted[0] > 0.2 * jnp.sum(jnp.abs(adapted[1:]), axis=0))
+    plain = js.laplace_beltrami(
+        CLOUDS["random"], js.find_neighbors(CLOUDS["random"], k=even.k), method=method
+    ).weights
+    assert jnp.any(plain[0] > 0)

@@ -1,0 +1,48 @@
+"""Pictures that several experiments draw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+
+def convergence(
+    path: Path,
+    spacings: Sequence[float] | Mapping[str, Sequence[float]],
+    errors: Mapping[str, Sequence[float]],
+    *,
+    orders: Sequence[float],
+    title: str,
+    label: str = "error",
+) -> None:
+    """Errors over the spacing on logarithmic axes, with lines of given slopes beneath."""
+    figure, ax = plt.subplots(figsize=(5.2, 4.2), layout="constrained")
+    markers = "osD^vPX<>*"
+    for marker, (name, values) in zip(markers * 5, errors.items()):
+        ax.loglog(
+            _of(spacings, name), values, marker + "-", label=name, markersize=4.5, linewidth=1
+        )
+    coarsest = {name: _of(spacings, name) for name in errors}
+    ends = np.array([min(map(min, coarsest.values())), max(map(max, coarsest.values()))])
+    # Guides start below curves spread evenly over those drawn, the highest for the lowest order.
+    starts = sorted(values[int(np.argmax(coarsest[name]))] for name, values in errors.items())
+    picks = np.linspace(len(starts) - 1, 0, len(orders)).round().astype(int)
+    for order, pick in zip(sorted(orders), picks):
+        guide = 0.5 * starts[pick] * (ends / ends[1]) ** order
+        ax.loglog(ends, guide, "k:", linewidth=0.9)
+        middle = np.sqrt(ends.prod()), np.sqrt(guide.prod())
+        ax.annotate(f"order {order:g}", middle, (4, -4), textcoords="offset points",
+                    fontsize=8, va="top")  # fmt: skip
+    ax.set_xlabel("spacing h")
+    ax.set_ylabel(label)
+    ax.set_title(title, fontsize="medium")
+    ax.legend(fontsize=8, frameon=False)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def _of(spacings, name: str):
+    return spacings[name] if isinstance(spacings, Mapping) else spacings

@@ -1,13 +1,16 @@
-import jax
-import jax.numpy as jnp
-import numpy as np
-import pytest
+"""All tests run in float64 and share one compilation cache, across workers and runs."""
 
-import jaxsurf as js
+from pathlib import Path
+
+import jax
 
 jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent / ".cache" / "jax"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
+try:
+    import matplotlib
 
-@pytest.fixture(autouse=True)
-def _names_for_doctests(doctest_namespace):
-    doctest_namespace.update(js=js, jax=jax, jnp=jnp, np=np)
+    matplotlib.use("Agg")
+except ImportError:
+    pass

@@ -26,28 +26,43 @@ def cloud_of(points):
     return js.PointCloud(points, points / jnp.linalg.norm(points, axis=1, keepdims=True))
 
 
-def outputs(cloud, neighbors, method):
-    args = dict(neighbors=neighbors, method=method)
-    yield js.laplace_beltrami(cloud, **args)(FIELD)
-    yield js.surface_gradient(cloud, **args)(FIELD)
-    yield js.surface_divergence(cloud, **args)(VECTOR)
-    yield js.directional_derivative(cloud, VECTOR, **args)(FIELD)
-    yield js.diffusion(cloud, VECTOR[:, :, None] * VECTOR[:, None], **args)(FIELD)
-    yield js.mean_curvature(cloud, **args)
-    yield js.gauss_curvature(cloud, **args)
-    yield js.principal_curvatures(cloud, **args)[0]
-    yield js.mean_curvature_vector(cloud, **args)
-
-
 @each_method
-def test_everything_in_points_and_normals(method):
+def test_operators_in_points_and_normals(method):
     neighbors = js.choose_neighbors(CLOUD, method=method)
 
     def total(points):
-        return sum(smooth(v) for v in outputs(cloud_of(points), neighbors, method))
+        cloud = cloud_of(points)
+        laplacian = js.laplace_beltrami(cloud, neighbors, method=method)
+        divergence = js.surface_divergence(cloud, neighbors, method=method)
+        return smooth(laplacian(FIELD)) + smooth(divergence(VECTOR))
+
+    check_derivative(total, CLOUD.points * jnp.array([1.0, 1.2, 1.5]), step=1e-4)
+
+
+def test_other_operators_and_curvature():
+    args = dict(neighbors=js.choose_neighbors(CLOUD), method=js.DCPSE(order=2))
+
+    def derivatives(cloud):
+        yield js.surface_gradient(cloud, **args)(FIELD)
+        yield js.directional_derivative(cloud, VECTOR, **args)(FIELD)
+        yield js.diffusion(cloud, VECTOR[:, :, None] * VECTOR[:, None], **args)(FIELD)
+        yield js.biharmonic(cloud, **args)(FIELD)
+
+    def curvatures(cloud):
+        yield js.shape_tensor(cloud, **args)
+        yield js.mean_curvature(cloud, **args)
+        yield js.gauss_curvature(cloud, **args)
+        yield js.mean_curvature_vector(cloud, **args)
+        yield from js.principal_curvatures(cloud, **args)
 
     # Off the sphere, so that the principal curvatures differ.
-    check_derivative(total, CLOUD.points * jnp.array([1.0, 1.2, 1.5]), step=1e-4)
+    points = CLOUD.points * jnp.array([1.0, 1.2, 1.5])
+    for outputs in (derivatives, curvatures):
+        check_derivative(
+            lambda p, outputs=outputs: sum(smooth(v) for v in outputs(cloud_of(p))),
+            points,
+            step=1e-4,
+        )
 
 
 @each_method
@@ -99,13 +114,8 @@ def test_a_neighbor_crosses_the_edge_of_the_support(method):
     at_edge = js.PointCloud(jnp.asarray(points).at[j].set(start), CLOUD.normals)
     derivative = jax.grad(lambda s: value(s, at_edge))(0.0)
     h = 1e-5
-    inside = js.find_neighbors(
-        at_edge.__class__(at_edge.points.at[j].set(start - h * direction), CLOUD.normals),
-        radius=radius,
-        throw=False,
-    )
-    assert int(inside.mask[0].sum()) > 0 and bool((inside.indices[0] == j).any())
     difference = (float(value(h)) - float(value(-h))) / (2 * h)
+    assert abs(difference) > 1e-3  # other rows still depend on the point
     np.testing.assert_allclose(derivative, difference, rtol=1e-6)
 
 
@@ -135,7 +145,7 @@ def test_the_nearest_change(method):
 def test_padded_and_switched_off_rows_have_finite_gradients():
     keep = np.arange(CLOUD.n) % 10 != 0
     cloud = js.PointCloud(CLOUD.points, CLOUD.normals, active=keep)
-    for method in METHODS:
+    for method in (js.DCPSE(order=2), js.GFDM(degree=2)):
         neighbors = js.choose_neighbors(cloud, method=method)
 
         def total(points, neighbors=neighbors, method=method):

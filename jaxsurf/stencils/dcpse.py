@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .kernels import gaussian, support
+from .kernels import gaussian, support, taper
 from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive
 from .moments import moment_solve
 from .targets import AbstractTarget, Laplacian
@@ -66,8 +66,9 @@ class DCPSE(AbstractMethod):
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
         offsets, normals, mask = neighborhood.offsets, neighborhood.normals, neighborhood.mask
         k, dim = offsets.shape
+        r2 = jnp.sum(offsets**2, axis=1)
         given = neighborhood.radius if self.support is None else self.support
-        radius = support(jnp.sum(offsets**2, axis=1), mask, dim=dim - 1, radius=given)
+        radius = support(r2, mask, dim=dim - 1, radius=given)
         width = radius * (_width(self.order) if self.width is None else self.width)
         count = _layers(self.order) if self.layers is None else self.layers
         step = radius / (count + 0.5) if self.layer_spacing is None else self.layer_spacing
@@ -75,8 +76,11 @@ class DCPSE(AbstractMethod):
         heights = step * jnp.arange(-count, count + 1)
         copies = offsets[:, None] + heights[:, None] * normals[:, None]
         copies = copies.reshape(k * (2 * count + 1), dim)
-        on = jnp.repeat(mask, 2 * count + 1)
-        eta, condition, residual = _kernel(copies, on, width, radius, target, self.order)
+        # On the hollow side copies are nearer than their point, so the point itself has to fade
+        # as it leaves the support.
+        fade = jnp.where(mask, taper(r2 / radius**2), 0)
+        fade = jnp.repeat(fade, 2 * count + 1)
+        eta, condition, residual = _kernel(copies, fade, width, radius, target, self.order)
         eta = jnp.sum(eta.reshape(-1, k, 2 * count + 1), axis=2)
         diagnostics = Diagnostics.of(neighborhood, condition, residual, radius, count)
         return target.assemble(
@@ -123,7 +127,9 @@ class FlatDCPSE(AbstractMethod):
         given = neighborhood.radius if self.support is None else self.support
         radius = support(jnp.sum(offsets**2, axis=1), mask, dim=dim, radius=given)
         width = radius * (_width(self.order) if self.width is None else self.width)
-        eta, condition, residual = _kernel(offsets, mask, width, radius, target, self.order)
+        eta, condition, residual = _kernel(
+            offsets, mask.astype(offsets.dtype), width, radius, target, self.order
+        )
         diagnostics = Diagnostics.of(neighborhood, condition, residual, radius, 0)
         weights = _with_center(eta, target.order)
         return target.assemble(weights, jnp.eye(dim, dtype=weights.dtype)), diagnostics
@@ -146,11 +152,12 @@ def _degrees(derivative: int, order: int) -> tuple[int, int]:
     return 1 - derivative % 2, derivative + order - 1
 
 
-def _kernel(x, mask, width, radius, target, order):
+def _kernel(x, factor, width, radius, target, order):
+    """DC-PSE kernel (eqs. 5 to 7) at the points x, of weight Gaussian times a given factor."""
     low, high = _degrees(target.order, order)
     scaled = x / width
     r2 = jnp.sum(x**2, axis=1)
-    w = jnp.where(mask, gaussian(r2, width, radius), 0)
+    w = factor * gaussian(r2, width, radius)
     b = jnp.asarray(target.moments(x.shape[1], low, high), x.dtype)
     eta, condition, residual = moment_solve(scaled.T, w, b, low, high)
     return eta / width**target.order, condition, residual

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 
 def taper(s: Float[Array, "*q"]) -> Float[Array, "*q"]:
-    r"""Cut-off $(1 - s^4)^3$ for $s = r^2/\rho^2 < 1$, else 0: flat inside, twice differentiable."""
+    r"""Cut-off $(1 - s^4)^3$ for $s = r^2/\rho^2 < 1$, else 0: twice differentiable."""
     inside = s < 1
     s = jnp.where(inside, s, 0)
     return jnp.where(inside, (1 - s**4) ** 3, 0)

@@ -39,7 +39,7 @@ def _parents(dim: int, high: int) -> tuple[tuple[int, int], ...]:
     place, parents = position(dim, high), []
     for gamma in list(place)[1:]:
         axis = next(a for a in range(dim) if gamma[a])
-        lower = gamma[:axis] + (gamma[axis] - 1,) + gamma[axis + 1 :]
+        lower = (*gamma[:axis], gamma[axis] - 1, *gamma[axis + 1 :])
         parents.append((place[lower], axis))
     return tuple(parents)
 
@@ -60,7 +60,7 @@ def differentiation(dim: int, high: int) -> np.ndarray:
     for gamma, column in place.items():
         for axis in range(dim):
             if gamma[axis]:
-                lower = gamma[:axis] + (gamma[axis] - 1,) + gamma[axis + 1 :]
+                lower = (*gamma[:axis], gamma[axis] - 1, *gamma[axis + 1 :])
                 matrices[axis, place[lower], column] = gamma[axis]
     return matrices
 

@@ -99,7 +99,7 @@ class Stencil(AbstractOperator):
         split = u.ndim - len(self.in_shape)
         if split < 1 or u.shape[0] != self.n or u.shape[split:] != self.in_shape:
             raise ValueError(
-                f"field has shape {u.shape}, expected ({self.n}, ...) and components {self.in_shape}"
+                f"field has shape {u.shape}, expected ({self.n}, ...) and then {self.in_shape}"
             )
         batch = u.shape[1:split]
         columns = jnp.moveaxis(u.reshape(self.n, -1, q), 0, -1)

@@ -41,8 +41,8 @@ def main(arguments: list[str] | None = None) -> int:
     run = commands.add_parser("run", help="run experiments and write their numbers and pictures")
     run.add_argument("names", nargs="+", metavar="NAME", help="from `list`, in either case")
     run.add_argument("--quick", action="store_true", help="a version of about a minute")
-    run.add_argument("--out", type=Path, default=Path("results"), metavar="DIR",
-                     help="folder for JSON and pictures (default: results)")  # fmt: skip
+    run.add_argument("--out", type=Path, default=Path("out"), metavar="DIR",
+                     help="folder for JSON and pictures (default: out)")  # fmt: skip
     options = parser.parse_args(arguments)
 
     if options.command == "list":

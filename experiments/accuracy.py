@@ -10,11 +10,9 @@ import jaxsurf as js
 from jaxsurf.frames import estimate_normals
 
 from . import surfaces
-from .report import Row, method_name, relative_l2
+from .report import Method, Row, method_name, relative_l2
 
-TITLE = (
-    "Study: error of the Laplacian on the unit sphere, default stencils, against others' figures"
-)
+TITLE = "Study: error of the Laplacian on the unit sphere, with defaults, beside other codes"
 
 # What others reach at n = 1e5, on Fibonacci points and on jittered ones.
 _PEERS = {
@@ -26,7 +24,7 @@ _PEERS = {
 _METHODS = [js.DCPSE(order=r) for r in (2, 3, 4)] + [js.GFDM(degree=p) for p in (2, 3, 4, 5)]
 
 
-def polynomial_degree(method: js.AbstractMethod) -> int:
+def polynomial_degree(method: Method) -> int:
     """Degree of the polynomials that the Laplacian of a method is exact on."""
     return method.order + 1 if isinstance(method, js.DCPSE) else method.degree
 

@@ -14,7 +14,9 @@ width: here it is the mean spacing h. As in E2 the support is $r_c/0.82$.
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -83,7 +85,7 @@ def grid_curvatures(cloud: js.PointCloud, rows: int, spacing: float):
     edges = np.unique(np.r_[half, rows - half])
     margin = 6
     mean, gauss = np.empty(cloud.n), np.empty(cloud.n)
-    for low, high in zip(edges[:-1], edges[1:]):
+    for low, high in itertools.pairwise(edges):
         around = np.flatnonzero((row >= low - margin) & (row < high + margin))
         belt = js.PointCloud(cloud.points[around], cloud.normals[around])
         own = (row[around] >= low) & (row[around] < high)
@@ -97,7 +99,8 @@ def run(quick: bool, out: Path) -> list[Row]:
     ellipsoid = surfaces.ellipsoid(tuple(_AXES.tolist()))
     source = "paper 001, Fig. 4"
     rows: list[Row] = []
-    spacings, errors = [], {}
+    spacings: list[float] = []
+    errors: dict[tuple[str, str, str], list[float]] = {}
     progress = tqdm(total=2 * len(sizes), desc="E6")
     for size in sizes:
         u, v = parameter_grid(size)
@@ -122,7 +125,7 @@ def run(quick: bool, out: Path) -> list[Row]:
     counts = f"{(sizes[0] - 2) * 2 * sizes[0] + 2} to {grid.n}"
     for (kind, name, norm), values in errors.items():
         quantity = f"order of the {norm} error of the {name} curvature, at least"
-        setting = {"points": kind, "n": counts}
+        setting: dict[str, Any] = {"points": kind, "n": counts}
         row = Row(quantity, slope(spacings, values), setting, 2.0, source, 1.8, at_least=True)
         rows.append(row)
     for kind, (_, exact, found) in cases.items():

@@ -11,7 +11,7 @@ import numpy as np
 
 def convergence(
     path: Path,
-    spacings: Sequence[float] | Mapping[str, Sequence[float]],
+    spacings: Sequence[float],
     errors: Mapping[str, Sequence[float]],
     *,
     orders: Sequence[float],
@@ -22,13 +22,10 @@ def convergence(
     figure, ax = plt.subplots(figsize=(5.2, 4.2), layout="constrained")
     markers = "osD^vPX<>*"
     for marker, (name, values) in zip(markers * 5, errors.items()):
-        ax.loglog(
-            _of(spacings, name), values, marker + "-", label=name, markersize=4.5, linewidth=1
-        )
-    coarsest = {name: _of(spacings, name) for name in errors}
-    ends = np.array([min(map(min, coarsest.values())), max(map(max, coarsest.values()))])
+        ax.loglog(spacings, values, marker + "-", label=name, markersize=4.5, linewidth=1)
+    ends = np.array([min(spacings), max(spacings)])
     # Guides start below curves spread evenly over those drawn, the highest for the lowest order.
-    starts = sorted(values[int(np.argmax(coarsest[name]))] for name, values in errors.items())
+    starts = sorted(values[int(np.argmax(spacings))] for values in errors.values())
     picks = np.linspace(len(starts) - 1, 0, len(orders)).round().astype(int)
     for order, pick in zip(sorted(orders), picks):
         guide = 0.5 * starts[pick] * (ends / ends[1]) ** order
@@ -42,7 +39,3 @@ def convergence(
     ax.legend(fontsize=8, frameon=False)
     figure.savefig(path, dpi=150)
     plt.close(figure)
-
-
-def _of(spacings, name: str):
-    return spacings[name] if isinstance(spacings, Mapping) else spacings

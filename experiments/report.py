@@ -13,6 +13,8 @@ import numpy as np
 
 import jaxsurf as js
 
+Method = js.DCPSE | js.GFDM
+
 
 @dataclass(frozen=True)
 class Row:
@@ -72,11 +74,11 @@ def relative_l2(found, exact) -> float:
     return float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
 
 
-def method_name(method: js.AbstractMethod) -> str:
+def method_name(method: Method) -> str:
     """As it is written in code: `DCPSE(order=4)`."""
     if isinstance(method, js.GFDM):
         return f"GFDM(degree={method.degree})"
-    return f"{type(method).__name__}(order={method.order})"
+    return f"DCPSE(order={method.order})"
 
 
 def write_json(path: Path, name: str, rows: list[Row], seconds: float) -> None:

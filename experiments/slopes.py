@@ -10,13 +10,15 @@ import jaxsurf as js
 
 from . import surfaces
 from .pictures import convergence
-from .report import Row, method_name, relative_l2, slope
+from .report import Method, Row, method_name, relative_l2, slope
 
 TITLE = "Study: observed orders of the Laplacian on sphere, ellipsoid and torus"
 
 _KINDS = ("regular", "jittered", "Poisson disk")
 # The order of convergence that each method promises.
-_METHODS = {js.DCPSE(order=r): r for r in (2, 3, 4)} | {js.GFDM(degree=r + 1): r for r in (2, 3, 4)}
+_METHODS: dict[Method, int] = {js.DCPSE(order=r): r for r in (2, 3, 4)} | {
+    js.GFDM(degree=r + 1): r for r in (2, 3, 4)
+}
 
 
 def run(quick: bool, out: Path) -> list[Row]:
@@ -26,7 +28,7 @@ def run(quick: bool, out: Path) -> list[Row]:
     progress = tqdm(total=len(shapes) * len(_KINDS) * len(sizes) * len(_METHODS), desc="slopes")
     for surface in shapes:
         for kind in _KINDS:
-            errors: dict[js.AbstractMethod, list[float]] = {method: [] for method in _METHODS}
+            errors: dict[Method, list[float]] = {method: [] for method in _METHODS}
             for n in sizes:
                 cloud = surface.cloud(kind, n)
                 u, exact = surface.exact(cloud)

@@ -14,11 +14,16 @@ from tqdm import tqdm
 import jaxsurf as js
 
 from . import data, surfaces
-from .report import Row, method_name
+from .report import Method, Row, method_name
 
 TITLE = "Study: spectra of the default Laplacians, also on random points and the bunny"
 
-_METHODS = [js.DCPSE(order=2), js.DCPSE(order=4), js.GFDM(degree=2), js.GFDM(degree=4)]
+_METHODS: list[Method] = [
+    js.DCPSE(order=2),
+    js.DCPSE(order=4),
+    js.GFDM(degree=2),
+    js.GFDM(degree=4),
+]
 
 
 def clouds(n: int) -> Iterator[tuple[str, js.PointCloud]]:
@@ -35,7 +40,8 @@ def run(quick: bool, out: Path) -> list[Row]:
     cases = list(clouds(600 if quick else 2_000))
     if data.present() and not quick:
         cases.append(("bunny, resampled", data.bunny(2_960)))
-    rows, spectra = [], {}
+    rows: list[Row] = []
+    spectra: dict[tuple[str, Method], np.ndarray] = {}
     for (name, cloud), method in tqdm([(c, m) for c in cases for m in _METHODS], desc="stability"):
         laplacian = js.laplace_beltrami(cloud, method=method)
         values = scipy.linalg.eigvals(laplacian.to_scipy().toarray())

@@ -27,7 +27,7 @@ class Surface:
         phi: level set function, growing outwards.
         area: exact.
         size: largest distance from the origin.
-        parametric: maps m numbers pairs in the unit square to points and area elements.
+        parametric: maps points of the unit square to points and area elements.
     """
 
     name: str
@@ -72,7 +72,7 @@ class Surface:
         return jnp.exp(jnp.dot(jnp.array([1.0, 2.0, 1.5]), x) / self.size)
 
     def exact(self, cloud: js.PointCloud) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        r"""The field and its $\Delta_S u = \Delta u - 2 H\,\partial_n u - n^T (\nabla\nabla u)\,n$."""
+        r"""The field, $\Delta_S u = \Delta u - 2 H\,\partial_n u - n^T (\nabla\nabla u)\,n$."""
         x = cloud.points
         n = js.level_set_normals(self.phi, x)
         mean = js.level_set_curvature(self.phi, x)[0]

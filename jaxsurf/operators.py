@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .cloud import PointCloud, is_concrete
-from .neighbors import Neighbors, find_neighbors
+from .neighbors import Neighbors, find_neighbors, nearest_of
 from .stencils.dcpse import DCPSE, FlatDCPSE
 from .stencils.method import AbstractMethod, Neighborhood
 from .stencils.moments import blockwise
@@ -336,17 +336,14 @@ def _build(cloud, neighbors, method, target, throw) -> Stencil:
 
 @eqx.filter_jit
 def _weights(cloud, neighbors, method, target, rows=None):
-    """Weights `(*components, k, n)` and diagnostics of all stencils, or of some rows."""
+    """Weights `(*components, k, r)` and diagnostics of all stencils, or of those of some rows."""
     rows = jnp.arange(cloud.n) if rows is None else rows
-    index = neighbors.indices[rows]
     radius = neighbors.radius
-    if radius is not None:
-        radius = jnp.broadcast_to(radius, (cloud.n,))[rows]
     around = Neighborhood(
-        cloud.points[index] - cloud.points[rows][:, None],
-        cloud.normals[index],
-        neighbors.mask[rows],
-        radius,
+        cloud.points[neighbors.indices] - cloud.points[rows][:, None],
+        cloud.normals[neighbors.indices],
+        neighbors.mask,
+        None if radius is None else jnp.broadcast_to(radius, (cloud.n,))[rows],
     )
     weights, diagnostics = blockwise(
         lambda one: method.weights(one, target), method.batch_size, around
@@ -359,41 +356,45 @@ def _adapted(cloud, method, throw) -> tuple[Neighbors, tuple | None]:
     if not is_concrete(*jax.tree.leaves(cloud)):
         raise ValueError("neighbors=None needs concrete arrays; under jit pass the neighbours")
     on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
-    k = min(method.neighbor_count(cloud.dim), int(on.sum()))
+    available = int(on.sum())
+    k = min(method.neighbor_count(cloud.dim), available)
     neighbors = find_neighbors(cloud, k, throw=throw)
     _check_sizes(cloud, neighbors, method, Laplacian(), throw)
     weights = _weights(cloud, neighbors, method, Laplacian())
-    poor = on & _is_poor(*weights)
-    if not poor.any():
+    poor = np.flatnonzero(on & _is_poor(*weights))
+    widths = [min(int(k * growth), available) for growth in _GROWTH]
+    if not poor.size or widths[-1] == k:
         return neighbors, weights
-    for growth in _GROWTH:
-        wider = find_neighbors(cloud, min(int(k * growth), int(on.sum())), throw=False)
-        neighbors = _with_rows(neighbors, wider, poor)
-        # The rows to be tried again, filled up so that few shapes are ever compiled.
-        rows = np.flatnonzero(poor)
-        filled = np.resize(rows, 1 << int(np.ceil(np.log2(max(rows.size, 256)))))
-        again = _is_poor(*_weights(cloud, wider, method, Laplacian(), jnp.asarray(filled)))
-        poor[rows] = again[: rows.size]
-        if not poor.any():
-            break
-    return neighbors, None
+
+    # Filled up with copies, so that few shapes are ever compiled.
+    rows = np.resize(poor, max(64, 1 << (poor.size - 1).bit_length()))
+    indices, mask = nearest_of(cloud, rows, widths[-1])
+    chosen = np.full(rows.size, widths[-1])
+    still = np.ones(rows.size, bool)
+    for width in widths[:-1]:
+        narrow = Neighbors(jnp.asarray(indices), jnp.asarray(mask & _first(width, mask)))
+        again = _is_poor(*_weights(cloud, narrow, method, Laplacian(), jnp.asarray(rows)))
+        chosen = np.where(still & ~again, width, chosen)
+        still &= again
+    widest = chosen.max()
+    mask = (mask & _first(chosen[:, None], mask))[:, :widest]
+    indices = np.where(mask, indices[:, :widest], rows[:, None])
+    extra = ((0, 0), (0, widest - k))
+    all_indices = np.pad(np.asarray(neighbors.indices), extra)
+    all_indices[:, k:] = np.arange(cloud.n)[:, None]
+    all_mask = np.pad(np.asarray(neighbors.mask), extra)
+    all_indices[rows], all_mask[rows] = indices, mask
+    return Neighbors(jnp.asarray(all_indices), jnp.asarray(all_mask)), None
+
+
+def _first(count, mask: np.ndarray) -> np.ndarray:
+    return np.arange(mask.shape[1]) < count
 
 
 def _is_poor(weights, diagnostics) -> np.ndarray:
     weights, residual = np.asarray(weights), np.asarray(diagnostics.residual)
     others = np.sum(np.abs(weights[1:]), axis=0)
     return ~((-weights[0] >= _DOMINANCE * others) & (residual < _tolerance(weights.dtype)))
-
-
-def _with_rows(neighbors: Neighbors, wider: Neighbors, rows: np.ndarray) -> Neighbors:
-    extra = wider.k - neighbors.k
-    own = jnp.broadcast_to(jnp.arange(neighbors.n, dtype=jnp.int32)[:, None], (neighbors.n, extra))
-    indices = jnp.concatenate([neighbors.indices, own], axis=1)
-    mask = jnp.pad(neighbors.mask, ((0, 0), (0, extra)))
-    take = jnp.asarray(rows)[:, None]
-    return Neighbors(
-        jnp.where(take, wider.indices, indices), jnp.where(take, wider.mask, mask), None
-    )
 
 
 # --- checks --------------------------------------------------------------------------------

@@ -151,17 +151,41 @@ def cosine_slack(dtype) -> float:
 # --- the two searches on the host ----------------------------------------------------------
 
 
-def nearest(points, normals, tree, k: int, min_cosine: float):
-    """The k nearest acceptable points of each, from as many candidates as that takes."""
+def nearest_of(
+    cloud: PointCloud, rows: np.ndarray, k: int, *, min_cosine: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """The rows `rows` of `find_neighbors(cloud, k)`, without searching the others.
+
+    Returns:
+        Indices and mask, `(r, k)`; rows may come in any order and more than once.
+    """
+    rows = np.asarray(rows)
+    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    names = np.flatnonzero(on)
+    check_count(k, len(names))
+    points, normals = np.asarray(cloud.points)[names], np.asarray(cloud.normals)[names]
+    wanted = np.flatnonzero(on[rows])
+    place = (np.cumsum(on) - 1)[rows[wanted]]
+    tree = cKDTree(points.astype(float))
+    slots, accepted = nearest(points, normals, tree, k, min_cosine, rows=place)
+    indices, mask = np.tile(rows[:, None].astype(np.int32), k), np.zeros((len(rows), k), bool)
+    indices[wanted], mask[wanted] = names[slots], accepted
+    return indices, mask
+
+
+def nearest(points, normals, tree, k: int, min_cosine: float, *, rows=None):
+    """The k nearest acceptable points of each (of `rows`), from as many candidates as it takes."""
     n = len(points)
-    slots = np.tile(np.arange(n)[:, None], k)
-    mask = np.zeros((n, k), bool)
-    todo = np.arange(n)
+    rows = np.arange(n) if rows is None else rows
+    slots = np.tile(rows[:, None], k)
+    mask = np.zeros(slots.shape, bool)
+    todo = np.arange(len(rows))
     count = min(n, k + 4)
     most = min(n, max(8 * k, 64))
     while todo.size:
-        found = _query(tree, points[todo], count)
-        key, accepted = _judge(points, normals, todo[:, None], found, min_cosine)
+        centre = rows[todo]
+        found = _query(tree, points[centre], count)
+        key, accepted = _judge(points, normals, centre[:, None], found, min_cosine)
         # Beyond the farthest candidate there may be others at the same distance.
         sure = np.sum(accepted & (key < key.max(axis=1, keepdims=True)), axis=1) >= k
         done = sure | (count == most)
@@ -171,7 +195,7 @@ def nearest(points, normals, tree, k: int, min_cosine: float):
         slots[todo[done]] = np.take_along_axis(found[done], order, axis=1)
         todo = todo[~done]
         count = min(most, 2 * count)
-    return np.where(mask, slots, np.arange(n)[:, None]), mask
+    return np.where(mask, slots, rows[:, None]), mask
 
 
 def _within(points, normals, tree, radius, capacity, min_cosine: float, names):

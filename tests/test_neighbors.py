@@ -7,7 +7,7 @@ import pytest
 
 from jaxsurf.cells import SearchCapacity, allocate, search_neighbors
 from jaxsurf.cloud import PointCloud
-from jaxsurf.neighbors import find_neighbors, tube_ratio
+from jaxsurf.neighbors import find_neighbors, nearest_of, tube_ratio
 
 
 def fibonacci(n):
@@ -124,6 +124,22 @@ def test_switched_off_points():
     host = find_neighbors(cloud, radius=0.5, capacity=capacity.k)
     assert np.array_equal(found.indices, host.indices)
     assert np.array_equal(found.mask, host.mask)
+
+
+def test_search_of_some_rows_only():
+    x, normals = plates(1.0)
+    active = np.arange(len(x)) % 5 != 0
+    rows = np.array([401, 2, 0, 799, 2, 5, 63])  # 0 and 5 are switched off, 2 comes twice
+    for cloud in (PointCloud(x, normals), PointCloud(x, normals, active=active)):
+        everything = find_neighbors(cloud, 40)
+        indices, mask = nearest_of(cloud, rows, 40)
+        assert np.array_equal(indices, everything.indices[rows])
+        assert np.array_equal(mask, everything.mask[rows])
+    assert mask.any(axis=1).tolist() == [True, True, False, True, True, False, True]
+    with pytest.raises(ValueError, match="too few points: 640, with k = 641"):
+        nearest_of(cloud, rows, 641)
+    empty, _ = nearest_of(cloud, rows[:0], 40)
+    assert empty.shape == (0, 40)
 
 
 @pytest.mark.parametrize("shift", [0.0, 1e4])

@@ -1,0 +1,472 @@
+r"""The main job from end to end: a surface, its curvature, heat on it, and a gradient.
+
+What `jaxsurf demo` computes, and the notebook after it; the command line only prints it.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.monitoring
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .cloud import PointCloud
+from .curvature import gauss_curvature, mean_curvature
+from .formats import contents_of
+from .frames import tangent_frames
+from .io import read, write
+from .neighbors import Neighbors
+from .operators import choose_neighbors, laplace_beltrami
+from .plot import plot_fields
+from .shapes.implicit import double_torus, level_set, level_set_normals, project_to_level_set
+from .stencils.method import AbstractMethod
+from .stencils.stencil import Stencil
+
+# Where the pictures are taken from.
+VIEW = (0.7, -1.7, 1.3)
+STAGES = ("points", "neighbours", "operator", "spectrum", "curvature", "heat", "gradient", "files")
+
+
+class Surface(NamedTuple):
+    """A cloud that depends on one number, for the gradient.
+
+    Args:
+        cloud: the surface as sampled.
+        title: in words.
+        parameter: what is varied, in words, and its value in `cloud`.
+        moved: the cloud with the same points, for another value; differentiable.
+        up: axis that points up in pictures.
+    """
+
+    cloud: PointCloud
+    title: str
+    parameter: tuple[str, float]
+    moved: Callable[[Float[Array, ""]], PointCloud]
+    up: tuple[float, float, float]
+
+    @property
+    def size(self) -> float:
+        """Longest side of the box around the points."""
+        return float(np.ptp(np.asarray(self.cloud.points), axis=0).max())
+
+
+def built_in_surface(n: int = 10_000, *, thickness: float = 0.4) -> Surface:
+    """A smooth surface of genus two, sampled on its level set; the tubes' thickness varies."""
+    phi, bounds = double_torus(thickness)
+    chosen = level_set(phi, n=n, bounds=bounds)
+
+    @jax.jit
+    def moved(thickness):
+        phi = double_torus(thickness)[0]
+        points = project_to_level_set(phi, chosen.points)
+        return PointCloud(points, level_set_normals(phi, points))
+
+    title = f"double torus, tubes of radius {thickness:g} (built in)"
+    return Surface(chosen, title, ("thickness of the tubes", thickness), moved, (0.0, 0.0, 1.0))
+
+
+def surface_from_file(path: str | Path, n: int | None = 20_000) -> Surface:
+    """A mesh resampled to n points, or a file's own points (n None, or no triangles in it).
+
+    What `read` converts it states in warnings. The size of the whole varies.
+    """
+    has_triangles = bool(contents_of(path).faces)
+    cloud = read(path, n=n if has_triangles else None)
+    own = "its own points" if n is None or not has_triangles else "resampled evenly"
+
+    @jax.jit
+    def moved(scale):
+        return eqx.tree_at(lambda c: c.points, cloud, scale * cloud.points)
+
+    # Scans are usually stored with y up.
+    up = (0.0, 1.0, 0.0)
+    return Surface(cloud, f"{Path(path).name} ({own})", ("scale of all points", 1.0), moved, up)
+
+
+# --- spectrum ------------------------------------------------------------------------------
+
+
+class Spectrum(NamedTuple):
+    """Outer eigenvalues of an operator: largest modulus, largest real part."""
+
+    radius: float
+    abscissa: float
+
+
+def spectral_estimate(operator: Stencil, *, steps: int = 40, degree: int = 24) -> Spectrum:
+    r"""Largest modulus and largest real part of an operator's eigenvalues, by Arnoldi's method.
+
+    The modulus from the Krylov space of the operator A. The real part from that of a Chebyshev
+    polynomial of A, which is at most 1 on the left 98 per cent of $[-\rho, 0]$ and grows steeply
+    from there to the right: slow and growing modes stand out. In both, the eigenvalues are those
+    of A projected on the space. On a closed surface the largest real part is that of the
+    constants, zero; a positive one is a mode that grows.
+
+    Args:
+        operator: takes and gives scalar fields.
+        steps: dimension of the spaces.
+        degree: of the polynomial.
+    """
+    start = np.random.default_rng(0).normal(size=operator.n)
+    steps = min(steps, operator.n - 1)
+    radius, abscissa = _spectrum(operator, jnp.asarray(start, operator.weights.dtype), steps, degree)
+    return Spectrum(float(jnp.abs(jnp.asarray(radius)).max()), float(abscissa.real.max()))
+
+
+@eqx.filter_jit
+def _spectrum(operator, start, steps: int, degree: int):
+    outer = _projected_eigenvalues(operator, _krylov_space(operator, start, steps))
+    radius = jnp.max(jnp.abs(outer))
+
+    center, half = 0.51 * radius, 0.49 * radius
+
+    def shifted(v):
+        return (operator(v) + center * v) / half
+
+    def chebyshev(v):
+        def recur(pair, _):
+            last, now = pair
+            return (now, 2 * shifted(now) - last), None
+
+        return jax.lax.scan(recur, (v, shifted(v)), length=degree - 1)[0][1]
+
+    return radius, _projected_eigenvalues(operator, _krylov_space(chebyshev, start, steps // 2))
+
+
+def _krylov_space(apply, start, steps: int):
+    """Orthonormal rows that span start, A start, ..., A^steps start."""
+    space = jnp.zeros((steps + 1, start.size), start.dtype).at[0].set(start / jnp.linalg.norm(start))
+
+    def extend(space, j):
+        v = apply(space[j])
+        for _ in range(2):  # twice is enough (Gram-Schmidt)
+            v = v - space.T @ (space @ v)
+        return space.at[j + 1].set(v / jnp.linalg.norm(v)), None
+
+    return jax.lax.scan(extend, space, jnp.arange(steps))[0]
+
+
+def _projected_eigenvalues(operator, space):
+    return jnp.linalg.eigvals(space @ operator(space.T))
+
+
+# --- heat ----------------------------------------------------------------------------------
+
+
+def cell_areas(cloud: PointCloud, neighbors: Neighbors, *, rays: int = 120) -> Float[Array, " n"]:
+    r"""Area of each point's Voronoi cell in its tangent plane (length of it on a curve).
+
+    A cell reaches as far as $\min_j |d_j|^2/2 d_j\cdot e$ in direction e. On a border, where
+    it would be endless, cells end at the distance of the sixth neighbour.
+
+    Accuracy: O(h²) on quasi-uniform points.
+    """
+    slots = neighbors.indices[:, 1:20]
+    used = neighbors.mask[:, 1:20]
+    offsets = cloud.points[slots] - cloud.points[:, None]
+    tangents = tangent_frames(cloud.normals)[:, :-1]
+    flat = jnp.einsum("nkd,ntd->nkt", offsets, tangents)
+    squared = jnp.sum(flat**2, axis=2)
+    if cloud.dim == 2:
+        directions = jnp.array([[1.0], [-1.0]])
+        share, power = 1.0, 1
+    else:
+        angle = 2 * jnp.pi * jnp.arange(rays) / rays
+        directions = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+        share, power = float(jnp.pi / rays), 2
+    farthest = jnp.sqrt(squared[:, min(5, slots.shape[1] - 1)])
+
+    def add(total, direction):
+        ahead = flat @ direction
+        reach = jnp.where(used & (ahead > 0), squared / (2 * jnp.where(ahead > 0, ahead, 1)), jnp.inf)
+        return total + jnp.minimum(jnp.min(reach, axis=1), farthest) ** power, None
+
+    return share * jax.lax.scan(add, jnp.zeros(cloud.n, flat.dtype), directions)[0]
+
+
+def hottest_point(surface: Surface, *, view: tuple[float, float, float] = VIEW) -> int:
+    """The point nearest to the viewer, of those well away from borders."""
+    cloud = surface.cloud
+    points = np.asarray(cloud.points)
+    height = points @ np.resize(np.asarray(view), cloud.dim)
+    if cloud.boundary is not None and np.asarray(cloud.boundary).any():
+        border = points[np.asarray(cloud.boundary)]
+        apart = np.min(np.linalg.norm(points[:, None] - border[None, ::4], axis=2), axis=1)
+        height = np.where(apart >= min(0.3 * surface.size, apart.max()), height, -np.inf)
+    return int(np.argmax(height))
+
+
+class Heat(NamedTuple):
+    """How long, in how many steps of Heun's method, and when to look."""
+
+    until: float
+    steps: int
+    frames: tuple[float, ...]
+
+    @staticmethod
+    def within(until: float, radius: float) -> Heat:
+        """As few steps as are stable with a margin: Heun's method needs dt rho < 2."""
+        return Heat(until, max(int(np.ceil(until * radius / 1.6)), 10), (0.0, until / 5, until))
+
+
+@eqx.filter_jit
+def diffuse(laplacian: Stencil, start: Float[Array, " n"], heat: Heat) -> Float[Array, "frames n"]:
+    r"""Temperatures $u_t = \Delta_S u$ at the frames. Differentiable in the operator and start."""
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, u, operator: operator(u)),
+        diffrax.Heun(),
+        0.0,
+        heat.until,
+        heat.until / heat.steps,
+        start,
+        args=laplacian,
+        saveat=diffrax.SaveAt(ts=heat.frames),
+        # One more than counted: the sum of the steps may end just below the final time.
+        max_steps=heat.steps + 1,
+        adjoint=diffrax.RecursiveCheckpointAdjoint(),
+    )
+    return solution.ys
+
+
+# --- the whole -----------------------------------------------------------------------------
+
+
+@dataclass
+class Demo:
+    """Everything the report says."""
+
+    surface: Surface
+    method: AbstractMethod
+    laplacian: Stencil
+    spectrum: Spectrum
+    curvature: dict[str, Float[Array, " n"]]
+    heat: Heat
+    temperature: Float[Array, "frames n"]
+    areas: Float[Array, " n"]
+    source: int
+    probe: int
+    influence: Float[Array, " n"]
+    gradient: float
+    difference: float
+    notes: list[str] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+    seconds: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def content(self) -> Float[np.ndarray, " frames"]:
+        """Heat on the whole surface at each frame."""
+        return np.asarray(self.temperature @ self.areas)
+
+    @property
+    def lost(self) -> float:
+        """Relative change of the heat from first to last."""
+        return float(abs(self.content[-1] / self.content[0] - 1))
+
+    @property
+    def disagreement(self) -> float:
+        """Relative difference of the gradient and the central difference."""
+        return abs(self.gradient - self.difference) / max(abs(self.difference), 1e-300)
+
+    @property
+    def peaks(self) -> Float[np.ndarray, " frames"]:
+        """Largest |u| at each frame."""
+        return np.asarray(jnp.max(jnp.abs(self.temperature), axis=1))
+
+    @property
+    def stable(self) -> bool:
+        """True if the largest |u| never grew."""
+        return bool(np.all(np.diff(self.peaks) <= 1e-6 * self.peaks[0]))
+
+
+def run(
+    sample: Callable[[], Surface],
+    *,
+    method: AbstractMethod,
+    out: Path,
+    until: float | None = None,
+    tell: Callable[[str], None] = lambda stage: None,
+) -> Demo:
+    """The main job: one pass through all `STAGES`.
+
+    Args:
+        sample: makes the surface.
+        method: of all operators.
+        out: folder for the picture and the ParaView file; made if absent.
+        until: final time of the heat; size²/50, rounded, if None.
+        tell: called with the name of each stage as it begins.
+
+    Raises:
+        ValueError, OSError, ImportError: as the functions of the package used here.
+    """
+    if until is not None and not until > 0:
+        raise ValueError(f"time = {until}, expected a positive number")
+    out.mkdir(parents=True, exist_ok=True)
+    seconds: dict[str, tuple[float, float]] = {}
+    notes: list[str] = []
+
+    @contextmanager
+    def stage(name: str):
+        tell(name)
+        with _timed() as spent, _noted(notes):
+            yield
+        seconds[name] = spent()
+
+    with stage("points"):
+        surface = sample()
+        cloud = surface.cloud
+    with stage("neighbours"):
+        neighbors = choose_neighbors(cloud, method=method)
+    with stage("operator"):
+        laplacian = laplace_beltrami(cloud, neighbors, method=method)
+        jax.block_until_ready(laplacian.weights)
+    with stage("spectrum"):
+        spectrum = spectral_estimate(_held_at_border(laplacian, cloud))
+    with stage("curvature"):
+        curvature = _curvature(cloud, neighbors, method)
+    with stage("heat"):
+        areas = cell_areas(cloud, neighbors)
+        source = hottest_point(surface)
+        start = _spot(cloud, source, surface.size / 16)
+        heat = Heat.within(until or _rounded(surface.size**2 / 50), spectrum.radius)
+        temperature = diffuse(_held_at_border(laplacian, cloud), start, heat)
+        temperature.block_until_ready()
+        probe = _probe(cloud, source, float(np.sqrt(2 * heat.until)))
+    with stage("gradient"):
+
+        def temperature_at_probe(value, start):
+            moved = surface.moved(value)
+            operator = laplace_beltrami(moved, neighbors, method=method)
+            return diffuse(_held_at_border(operator, moved), start, heat)[-1, probe]
+
+        value = jnp.asarray(surface.parameter[1], start.dtype)
+        gradient, influence = jax.jit(jax.grad(temperature_at_probe, argnums=(0, 1)))(value, start)
+        step = 1e-4 * value
+        rise = temperature_at_probe(value + step, start) - temperature_at_probe(value - step, start)
+        difference = rise / (2 * step)
+    demo = Demo(
+        surface,
+        method,
+        laplacian,
+        spectrum,
+        curvature,
+        heat,
+        temperature,
+        areas,
+        source,
+        probe,
+        influence / areas,
+        float(gradient),
+        float(difference),
+        seconds=seconds,
+    )
+    with stage("files"):
+        demo.files = save(demo, out)
+    demo.notes = list(dict.fromkeys(notes))
+    return demo
+
+
+def save(demo: Demo, out: Path) -> list[Path]:
+    """The picture and the ParaView file; a warning for what a missing package prevents."""
+    files, cloud, t = [], demo.surface.cloud, demo.heat.frames
+    if find_spec("matplotlib") is None:
+        warnings.warn("no picture: pip install 'jaxsurf[pictures]'", stacklevel=2)
+    else:
+        panels = {f"{name} curvature": values for name, values in demo.curvature.items()}
+        panels["sensitivity of the probe to heat at t = 0"] = demo.influence
+        panels |= {f"heat at t = {s:.3g}": u for s, u in zip(t, demo.temperature)}
+        files.append(out / "demo.png")
+        plot_fields(cloud, panels, path=files[-1], view=VIEW, up=demo.surface.up)
+    if find_spec("meshio") is None:
+        warnings.warn("no file for ParaView: pip install 'jaxsurf[files]'", stacklevel=2)
+    else:
+        fields = {f"{name}_curvature": values for name, values in demo.curvature.items()}
+        fields |= {f"heat_{i}": u for i, u in enumerate(demo.temperature)}
+        fields |= {"influence": demo.influence, "area": demo.areas}
+        if demo.laplacian.diagnostics is not None:
+            fields["tube"] = demo.laplacian.diagnostics.tube
+        files.append(out / "demo.vtu")
+        write(files[-1], cloud, fields)
+    return files
+
+
+def _held_at_border(laplacian: Stencil, cloud: PointCloud) -> Stencil:
+    """Border points keep their temperature: without it the problem is not well posed."""
+    return laplacian if cloud.boundary is None else laplacian.scaled(1.0 - cloud.boundary)
+
+
+def _curvature(cloud, neighbors, method) -> dict[str, Float[Array, " n"]]:
+    if cloud.dim == 2:
+        return {"curve": mean_curvature(cloud, neighbors, method=method)}
+    # In one compiled function the shape tensor that both need is computed once.
+    names = ("mean", "Gauss")
+    both = eqx.filter_jit(
+        lambda c: [f(c, neighbors, method=method) for f in (mean_curvature, gauss_curvature)]
+    )
+    return dict(zip(names, jax.block_until_ready(both(cloud))))
+
+
+def _spot(cloud: PointCloud, source: int, width: float) -> Float[Array, " n"]:
+    squared = jnp.sum((cloud.points - cloud.points[source]) ** 2, axis=1)
+    return jnp.exp(-squared / (2 * width**2))
+
+
+def _probe(cloud: PointCloud, source: int, distance: float) -> int:
+    """A point at about that distance from the source, on its side of the surface."""
+    points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+    off = np.abs(np.linalg.norm(points - points[source], axis=1) - distance)
+    if cloud.boundary is not None:
+        off = np.where(np.asarray(cloud.boundary), np.inf, off)
+    return int(np.argmin(np.where(normals @ normals[source] > 0, off, np.inf)))
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.1g}")
+
+
+@contextmanager
+def _noted(notes: list[str]) -> Iterator[None]:
+    """Collect the package's warnings as notes for the report."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", UserWarning)
+        yield
+    notes += [str(warning.message) for warning in caught]
+
+
+@contextmanager
+def _timed() -> Iterator[Callable[[], tuple[float, float]]]:
+    """Seconds spent compiling, and on everything else."""
+    spans: list[tuple[float, float]] = []
+    begin = time.perf_counter()
+
+    def listen(event: str, duration: float, **_):
+        if event.startswith("/jax/core/compile/"):
+            now = time.perf_counter()
+            spans.append((now - duration, now))
+
+    def spent():
+        # Traces within traces are reported each: count the union.
+        compiling, last = 0.0, begin
+        for first, end in sorted(spans):
+            compiling += max(end - max(first, last), 0)
+            last = max(last, end)
+        return compiling, finish - begin - compiling
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield spent
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+        finish = time.perf_counter()

@@ -9,7 +9,7 @@ quasi-uniform points with the same parameters is measured too.
 
 Equation (24) agrees with differentiation to round-off; its H belongs to outward normals as
 $+\tfrac12\nabla_S\cdot n$, while the text has a minus sign. The paper does not give the kernel's
-width: here it is the mean spacing h. As in E2 the support is $r_c/0.82$.
+width: here it is the mean spacing h. The smooth support that stands for $r_c$ is in `cutoff`.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ import jaxsurf as js
 from jaxsurf.plot import plot_fields
 
 from . import surfaces
+from .cutoff import smooth_support
 from .pictures import convergence
 from .report import Row, slope
 
 TITLE = "Mean and Gauss curvature of the ellipsoid (1, 0.8, 0.75), order 2 (paper 001, Fig. 4a-c)"
 
 _AXES = np.array([1.0, 0.8, 0.75])
-_SMOOTH = 0.82
 
 
 def published_curvature(u, v):
@@ -66,7 +66,7 @@ def grid_cloud(u, v) -> js.PointCloud:
 def curvatures(cloud: js.PointCloud, rows: int, spacing: float):
     """Mean and Gauss curvature with the paper's parameters."""
     layer_spacing = 3 / (rows - 1)
-    support = 2.9 * layer_spacing / _SMOOTH
+    support = smooth_support(2.9 * layer_spacing)
     neighbors = js.find_neighbors(cloud, radius=support)
     method = js.DCPSE(order=2, layers=2, layer_spacing=layer_spacing, width=spacing / support)
     return (
@@ -83,7 +83,7 @@ def grid_curvatures(cloud: js.PointCloud, rows: int, spacing: float):
     row = np.r_[0, np.repeat(np.arange(1, rows - 1), 2 * rows), rows - 1]
     half = np.unique(np.minimum([0, 4, 8, 16, 32], rows // 2))
     edges = np.unique(np.r_[half, rows - half])
-    margin = 6
+    margin = 7
     mean, gauss = np.empty(cloud.n), np.empty(cloud.n)
     for low, high in itertools.pairwise(edges):
         around = np.flatnonzero((row >= low - margin) & (row < high + margin))

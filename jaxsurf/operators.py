@@ -155,7 +155,7 @@ def directional_derivative(
     """
     gradient = _build(cloud, neighbors, method, Gradient(), throw)
     direction = _field(direction, (cloud.n, cloud.dim), "direction")
-    weights = jnp.einsum("na,akn->kn", direction, gradient.weights)
+    weights = jnp.einsum("na,kan->kn", direction, gradient.weights)
     return Stencil(gradient.indices, weights, diagnostics=gradient.diagnostics)
 
 
@@ -201,7 +201,7 @@ def diffusion(
         project = jnp.eye(cloud.dim) - cloud.normals[:, :, None] * cloud.normals[:, None]
         d = jnp.einsum("nab,nbc,ncd->nad", project, (d + d.mT) / 2, project)
         mean = (d + d[stencil.indices]) / 2
-        weights = jnp.einsum("knab,abkn->kn", mean, stencil.weights)
+        weights = jnp.einsum("knab,kabn->kn", mean, stencil.weights)
     else:
         shapes = f"({cloud.n},) or ({cloud.n}, {cloud.dim}, {cloud.dim})"
         raise ValueError(f"diffusivity has shape {d.shape}, expected {shapes}")
@@ -327,7 +327,7 @@ def _build(cloud, neighbors, method, target, throw) -> Stencil:
     if weights is None:
         weights = _weights(cloud, neighbors, method, target)
     values, diagnostics = weights
-    components = values.shape[:-2]
+    components = values.shape[1:-1]
     stencil = Stencil(neighbors.indices.T, values, components, (), diagnostics)
     if throw and is_concrete(values):
         _check(stencil, neighbors, method, target, cloud.dim)
@@ -336,7 +336,7 @@ def _build(cloud, neighbors, method, target, throw) -> Stencil:
 
 @eqx.filter_jit
 def _weights(cloud, neighbors, method, target, rows=None):
-    """Weights `(*components, k, r)` and diagnostics of all stencils, or of those of some rows."""
+    """Weights `(k, *components, r)` and diagnostics of all stencils, or of those of some rows."""
     rows = jnp.arange(cloud.n) if rows is None else rows
     radius = neighbors.radius
     around = Neighborhood(
@@ -348,7 +348,7 @@ def _weights(cloud, neighbors, method, target, rows=None):
     weights, diagnostics = blockwise(
         lambda one: method.weights(one, target), method.batch_size, around
     )
-    return jnp.moveaxis(weights, 0, -1), diagnostics
+    return jnp.moveaxis(weights, (-1, 0), (0, -1)), diagnostics
 
 
 def _adapted(cloud, method, throw) -> tuple[Neighbors, tuple | None]:

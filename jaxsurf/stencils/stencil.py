@@ -65,7 +65,7 @@ class Stencil(AbstractOperator):
 
     Args:
         indices: neighbour of point i in slot s, `(k, n)`.
-        weights: `(*out_shape, *in_shape, k, n)`; zero in padded slots.
+        weights: `(k, *out_shape, *in_shape, n)`; zero in padded slots.
         out_shape: `()` for scalar results, `(d,)` for a gradient.
         in_shape: `()` for scalar fields, `(d,)` for a divergence.
         diagnostics: how well each stencil is determined; None if unknown.
@@ -74,13 +74,13 @@ class Stencil(AbstractOperator):
     """
 
     indices: Int[Array, "k n"]
-    weights: Float[Array, "*c k n"]
+    weights: Float[Array, "k *c n"]
     out_shape: tuple[int, ...] = eqx.field(static=True, default=())
     in_shape: tuple[int, ...] = eqx.field(static=True, default=())
     diagnostics: Diagnostics | None = None
 
     def __check_init__(self):
-        shape = (*self.out_shape, *self.in_shape, *self.indices.shape)
+        shape = (self.k, *self.out_shape, *self.in_shape, self.n)
         if self.weights.shape != shape:
             raise ValueError(f"weights have shape {self.weights.shape}, expected {shape}")
 
@@ -95,25 +95,30 @@ class Stencil(AbstractOperator):
 
     def __call__(self, u):
         u = jnp.asarray(u)
-        q, p = math.prod(self.in_shape), math.prod(self.out_shape)
         split = u.ndim - len(self.in_shape)
         if split < 1 or u.shape[0] != self.n or u.shape[split:] != self.in_shape:
             raise ValueError(
                 f"field has shape {u.shape}, expected ({self.n}, ...) and then {self.in_shape}"
             )
         batch = u.shape[1:split]
-        columns = jnp.moveaxis(u.reshape(self.n, -1, q), 0, -1)
-        weights = jnp.moveaxis(self.weights.reshape(p, q, self.k, self.n), 2, 0)
-        dtype = jnp.result_type(u, weights)
+        # A single column is gathered alone; of several, whole rows.
+        values = u if u.ndim == 1 else u.reshape(self.n, -1, *self.in_shape)
+
+        def term(w, neighbor):
+            """One slot's part, `(*out_shape, n, *batch)`."""
+            if not self.in_shape:
+                return w * neighbor if u.ndim == 1 else w[..., None] * neighbor
+            return sum(w[..., i, :, None] * neighbor[..., i] for i in range(self.in_shape[0]))
 
         def add_slot(total, slot):
             w, j = slot
-            neighbor = columns.at[:, :, j].get(mode="promise_in_bounds")
-            return total + jnp.sum(w * neighbor[:, None], axis=2), None
+            return total + term(w, values.at[j].get(mode="promise_in_bounds")), None
 
-        zero = jnp.zeros((columns.shape[0], p, self.n), dtype)
-        total, _ = jax.lax.scan(add_slot, zero, (weights, self.indices))
-        return jnp.moveaxis(total, -1, 0).reshape(self.n, *batch, *self.out_shape)
+        shape = (*self.out_shape, *values.shape[: values.ndim - len(self.in_shape)])
+        zero = jnp.zeros(shape, jnp.result_type(u, self.weights))
+        total, _ = jax.lax.scan(add_slot, zero, (self.weights, self.indices))
+        total = jnp.moveaxis(total, 0, -1) if self.out_shape else total
+        return total.reshape(self.n, *batch, *self.out_shape)
 
     def transpose(self) -> Stencil:
         """The transposed stencil, again with one gather per slot.
@@ -123,20 +128,20 @@ class Stencil(AbstractOperator):
         """
         slots, order = _incoming(np.asarray(self.indices))
         source = np.broadcast_to(np.arange(self.n), self.indices.shape).ravel()[order]
-        flat = self.weights.reshape(*self.out_shape, *self.in_shape, -1)[..., order]
         place, row = slots
         k = int(place.max()) + 1
         indices = np.broadcast_to(np.arange(self.n, dtype=np.int32), (k, self.n)).copy()
         indices[place, row] = source
-        moved = jnp.zeros((*self.weights.shape[:-2], k, self.n), self.weights.dtype)
-        moved = moved.at[..., place, row].set(flat)
+        flat = jnp.moveaxis(self.weights, -1, 1).reshape(self.k * self.n, *self.weights.shape[1:-1])
+        moved = jnp.zeros((k, self.n, *self.weights.shape[1:-1]), self.weights.dtype)
+        moved = jnp.moveaxis(moved.at[place, row].set(flat[order]), 1, -1)
         if self.out_shape and self.in_shape:
-            moved = jnp.moveaxis(moved, 0, 1)
+            moved = jnp.swapaxes(moved, 1, 2)
         return Stencil(jnp.asarray(indices), moved, self.in_shape, self.out_shape)
 
     def to_scipy(self):
         p, q, n = math.prod(self.out_shape), math.prod(self.in_shape), self.n
-        weights = np.asarray(self.weights).reshape(p, q, self.k, n)
+        weights = np.moveaxis(np.asarray(self.weights).reshape(self.k, p, q, n), 0, 2)
         columns = np.asarray(self.indices)
         rows = np.broadcast_to(np.arange(n), columns.shape)
         a, b = np.arange(p)[:, None, None, None], np.arange(q)[:, None, None]

@@ -1,0 +1,139 @@
+"""Run every case in a process of its own, write the table."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+from tqdm import tqdm
+
+from . import cases
+
+# Measured on a 2-core machine of the same kind, one process each: build s and apply ms at 1e5.
+PEERS = {
+    "GFDM(degree=2)": ("Compadre GMLS, degree 2, k = 13", "2.5-4.5", "19"),
+    "GFDM(degree=4)": ("Compadre GMLS, degree 4, k = 37", "15-22", "34"),
+    "DCPSE(order=2)": ("OpenFPM Surface DC-PSE, order 2, k = 26", "14", "22"),
+    "DCPSE(order=4)": ("OpenFPM Surface DC-PSE, order 4, k = 47", "107-125", "41"),
+}
+README = Path(__file__).parents[2] / "README.md"
+MARKS = ("<!-- benchmarks: begin -->", "<!-- benchmarks: end -->")
+
+
+def plan(quick: bool) -> list[tuple[str, list]]:
+    n = 20_000 if quick else 100_000
+    million = 100_000 if quick else 1_000_000
+    gradient_n = 2_000 if quick else 10_000
+    todo: list[tuple[str, list]] = [("bandwidth", [])]
+    todo += [("apply", [m, k]) for m in (n, million) for k in (20, 40)]
+    todo += [("apply", [n, k]) for k in (26, 37, 47)]
+    todo += [("build", [name, n]) for name in cases.METHODS]
+    todo += [("build_beside_numpy", [2, 20, n]), ("build_beside_numpy", [4, 37, n])]
+    todo += [("build_beside_plain_jax", [n])]
+    todo += [("build", ["DCPSE(order=2)", m]) for m in (n // 10, million)]
+    todo += [
+        ("gradient", [name, gradient_n, reverse])
+        for name in cases.METHODS
+        for reverse in (False, True)
+    ]
+    return [*todo, ("retraces", [])]
+
+
+def run_case(name: str, arguments: list) -> dict:
+    command = [sys.executable, "-m", "experiments.benchmarks", "--case", name]
+    done = subprocess.run(
+        [*command, json.dumps(arguments)], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise RuntimeError(f"{name} {arguments} failed:\n{done.stderr[-2000:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def find(results: list[dict], case: str, *arguments) -> dict:
+    return next(
+        r["result"] for r in results if r["case"] == case and r["arguments"] == [*arguments]
+    )
+
+
+def table(results: list[dict], quick: bool) -> str:
+    """The Markdown table that the README quotes."""
+    n, gradient_n = (20_000, 2_000) if quick else (100_000, 10_000)
+    lines = [
+        f"Sphere, n = {n:,}, float64, {platform.machine()}, 2 cores, jax {jax.__version__}; "
+        f"gradient and its ratio to the forward pass at n = {gradient_n:,}. Peers as measured on "
+        "such a machine, one process.",
+        "",
+        "| method | k | build s | first call s | apply ms | gradient s | / forward | peak GiB "
+        "| peer | "
+        "its build s | its apply ms |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, (_, k) in cases.METHODS.items():
+        build = find(results, "build", name, n)
+        apply = find(results, "apply", n, k)
+        forward = find(results, "gradient", name, gradient_n, False)
+        reverse = find(results, "gradient", name, gradient_n, True)
+        lines.append(
+            f"| `{name}` | {k} | {build['build s']:.2f} | {build['first call s']:.1f} "
+            f"| {apply['ours ms']:.2f} | {reverse['s']:.2f} | {reverse['s'] / forward['s']:.1f} "
+            f"| {build['peak GiB']:.2f} | " + " | ".join(PEERS[name]) + " |"
+        )
+    lines += ["", "| applying | SciPy CSR ms | ours ms | ratio | share of bandwidth |",
+              "|---|---|---|---|---|"]  # fmt: skip
+    for r in results:
+        if r["case"] == "apply" and r["arguments"][1] in (20, 40):
+            (m, k), v = r["arguments"], r["result"]
+            lines.append(
+                f"| n = {m:,}, k = {k} | {v['SciPy CSR ms']:.2f} | {v['ours ms']:.2f} "
+                f"| {v['ratio']:.2f} | {v['share of bandwidth']:.0%} |"
+            )
+    lines += ["", "| building GFDM | NumPy s | ours s | NumPy / ours |", "|---|---|---|---|"]
+    for r in results:
+        if r["case"] == "build_beside_numpy":
+            (degree, k, _), v = r["arguments"], r["result"]
+            lines.append(
+                f"| degree {degree}, k = {k} | {v['NumPy s']:.2f} | {v['ours s']:.2f} "
+                f"| {v['NumPy / ours']:.1f} |"
+            )
+    lines += ["", "| DCPSE(order=2), n | build s | peak GiB |", "|---|---|---|"]
+    for r in results:
+        if r["case"] == "build" and r["arguments"][0] == "DCPSE(order=2)":
+            v = r["result"]
+            lines.append(f"| {r['arguments'][1]:,} | {v['build s']:.2f} | {v['peak GiB']:.2f} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m experiments.benchmarks", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="smaller sizes")
+    parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR")
+    parser.add_argument("--readme", action="store_true", help="put the table into the README")
+    parser.add_argument("--case", nargs=2, metavar=("NAME", "ARGUMENTS"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.case:
+        jax.config.update("jax_enable_x64", True)
+        name, arguments = options.case
+        print(json.dumps(getattr(cases, name)(*json.loads(arguments))))
+        return
+    results = []
+    for name, arguments in tqdm(plan(options.quick), desc="benchmarks", unit="case"):
+        result = run_case(name, arguments)
+        results.append({"case": name, "arguments": arguments, "result": result})
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "benchmarks.json").write_text(json.dumps(results, indent=1))
+    text = table(results, options.quick)
+    (options.out / "benchmarks.md").write_text(text + "\n")
+    print(text)
+    if options.readme:
+        begin, end = MARKS
+        before, rest = README.read_text().split(begin)
+        README.write_text(f"{before}{begin}\n{text}\n{end}{rest.split(end)[1]}")
+
+
+if __name__ == "__main__":
+    main()

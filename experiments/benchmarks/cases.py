@@ -1,0 +1,143 @@
+"""One measurement per function; each runs in a process of its own, so that its memory counts."""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxsurf as js
+
+from .baselines import numpy_gfdm, plain_jax_gfdm
+from .timing import first_and_median, peak_gib, side_by_side
+
+METHODS = {
+    "GFDM(degree=2)": (js.GFDM(degree=2), 20),
+    "GFDM(degree=4)": (js.GFDM(degree=4), 37),
+    "DCPSE(order=2)": (js.DCPSE(order=2), 26),
+    "DCPSE(order=4)": (js.DCPSE(order=4), 47),
+}
+
+
+def _sphere(n: int, k: int):
+    cloud = js.sphere(n)
+    return cloud, js.find_neighbors(cloud, k=k, throw=False)
+
+
+def _laplacian(cloud, neighbors, method):
+    return js.laplace_beltrami(cloud, neighbors, method=method, throw=False)
+
+
+def bandwidth() -> dict:
+    """Memory bandwidth, by a sum of two arrays of 256 MiB into a third."""
+    a, b = jnp.ones(2**25), jnp.full(2**25, 2.0)
+    _, seconds = first_and_median(partial(jax.jit(lambda a, b: a + b), a, b))
+    return {"GB/s": 3 * a.nbytes / seconds / 1e9}
+
+
+def apply(n: int, k: int) -> dict:
+    """Applying a Laplacian, beside the product with SciPy's CSR matrix and the bandwidth."""
+    cloud, neighbors = _sphere(n, k)
+    operator = _laplacian(cloud, neighbors, js.GFDM(degree=2))
+    matrix = operator.to_scipy()
+    u = jnp.sin(cloud.points @ jnp.array([1.0, 2.0, 1.5]))
+    u_host = np.asarray(u)
+    call = jax.jit(lambda operator, u: operator(u))
+    ours, scipys, ratio = side_by_side(lambda: call(operator, u), lambda: matrix @ u_host, 31)
+    np.testing.assert_allclose(call(operator, u), matrix @ u_host, atol=1e-6)
+    moved = operator.weights.nbytes + operator.indices.nbytes + 2 * u.nbytes
+    rate = moved / ours / 1e9
+    return {"ours ms": 1e3 * ours, "SciPy CSR ms": 1e3 * scipys, "ratio": ratio,
+            "GB/s": rate, "share of bandwidth": rate / bandwidth()["GB/s"]}  # fmt: skip
+
+
+def build(name: str, n: int) -> dict:
+    """Building the Laplacian for given neighbours; the first call compiles."""
+    method, k = METHODS[name]
+    cloud, neighbors = _sphere(n, k)
+    before = peak_gib()
+    first, seconds = first_and_median(
+        lambda: _laplacian(cloud, neighbors, method).weights, 3 if n > 2e5 else 5
+    )
+    return {"build s": seconds, "first call s": first - seconds,
+            "peak GiB": peak_gib(), "GiB before": before}  # fmt: skip
+
+
+def build_beside_numpy(degree: int, k: int, n: int) -> dict:
+    """The same GFDM stencil by batched NumPy, in turn."""
+    cloud, neighbors = _sphere(n, k)
+    points, normals, index = (
+        np.asarray(a) for a in (cloud.points, cloud.normals, neighbors.indices)
+    )
+    ours, theirs, ratio = side_by_side(
+        lambda: _laplacian(cloud, neighbors, js.GFDM(degree=degree)).weights,
+        lambda: numpy_gfdm(points, normals, index, degree),
+        5,
+    )
+    return {"ours s": ours, "NumPy s": theirs, "NumPy / ours": 1 / ratio}
+
+
+def build_beside_plain_jax(n: int) -> dict:
+    """GFDM of degree 2 in a few lines of plain JAX: building, and the gradient in the points."""
+    cloud, neighbors = _sphere(n, 20)
+    u = jnp.sin(cloud.points @ jnp.array([1.0, 2.0, 1.5]))
+    index = neighbors.indices
+
+    def total_ours(x):
+        cloud_x = js.PointCloud(x, cloud.normals)
+        return jnp.sum(_laplacian(cloud_x, neighbors, js.GFDM(degree=2))(u) ** 2)
+
+    def total_plain(x):
+        weights = plain_jax_gfdm(x, cloud.normals, index, 2)
+        return jnp.sum(jnp.sum(weights * u[index], axis=1) ** 2)
+
+    plain = jax.jit(lambda: plain_jax_gfdm(cloud.points, cloud.normals, index, 2))
+    build_ours, build_plain, _ = side_by_side(
+        lambda: _laplacian(cloud, neighbors, js.GFDM(degree=2)).weights, plain, 5
+    )
+    ours, theirs = (jax.jit(jax.grad(f)) for f in (total_ours, total_plain))
+    grad_ours, grad_plain, _ = side_by_side(
+        lambda: ours(cloud.points), lambda: theirs(cloud.points), 5
+    )
+    return {"ours s": build_ours, "plain JAX s": build_plain,
+            "gradient ours s": grad_ours, "gradient plain JAX s": grad_plain}  # fmt: skip
+
+
+def gradient(name: str, n: int, reverse: bool) -> dict:
+    """A scalar of the operator, or its gradient in points and normals."""
+    method, k = METHODS[name]
+    cloud, neighbors = _sphere(n, k)
+    u = jnp.sin(cloud.points @ jnp.array([1.0, 2.0, 1.5]))
+
+    def total(points, normals):
+        operator = _laplacian(js.PointCloud(points, normals), neighbors, method)
+        return jnp.sum(operator(u) ** 2)
+
+    f = jax.jit(jax.grad(total, argnums=(0, 1)) if reverse else total)
+    before = peak_gib()
+    start = time.perf_counter()
+    compiled = f.lower(cloud.points, cloud.normals).compile()
+    compile_seconds = time.perf_counter() - start
+    memory = compiled.memory_analysis()
+    _, seconds = first_and_median(lambda: compiled(cloud.points, cloud.normals), 5)
+    return {"s": seconds, "compile s": compile_seconds, "peak GiB": peak_gib(),
+            "GiB before": before, "temporary MiB": memory.temp_size_in_bytes / 2**20}  # fmt: skip
+
+
+def retraces() -> dict:
+    """How often two calls of the same shape trace the operator."""
+    cloud, neighbors = _sphere(2000, 26)
+    count = 0
+
+    @jax.jit
+    def apply(points):
+        nonlocal count
+        count += 1
+        return _laplacian(js.PointCloud(points, cloud.normals), neighbors, js.DCPSE())(points)
+
+    apply(cloud.points)
+    apply(1.1 * cloud.points)
+    return {"traces": count}

@@ -15,6 +15,7 @@ from . import (
     accuracy,
     e01_circle_laplacian,
     e02_sphere_laplacian,
+    e03_closest_point,
     e06_ellipsoid_curvature,
     e07_bunny_curvature,
     slopes,
@@ -25,6 +26,7 @@ from .report import table, write_json
 EXPERIMENTS: dict[str, ModuleType] = {
     "E1": e01_circle_laplacian,
     "E2": e02_sphere_laplacian,
+    "E3": e03_closest_point,
     "E6": e06_ellipsoid_curvature,
     "E7": e07_bunny_curvature,
     "accuracy": accuracy,

@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def sample():
         if options.surface is None:
             return demo.built_in_surface(10_000 if options.points is None else options.points)
-        points = 20_000 if options.points is None else options.points
+        points = 10_000 if options.points is None else options.points
         return demo.surface_from_file(options.surface, None if points == "all" else points)
 
     if options.points == "all" and options.surface is None:
@@ -83,8 +83,8 @@ def _parser() -> argparse.ArgumentParser:
         "--points",
         type=_points,
         metavar="N",
-        help="sample the surface evenly with N points (default: 10000; a mesh from a file: "
-        "20000), or 'all' for the vertices of the file as they are",
+        help="sample the surface evenly with N points (default: 10000), or 'all' for the "
+        "vertices of the file as they are",
     )
     one.add_argument(
         "--out",
@@ -97,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
         "--time",
         type=float,
         metavar="T",
-        help="diffuse until this time (default: size squared / 50)",
+        help="diffuse until this time (default: size squared / 100)",
     )
     one.add_argument(
         "--method",
@@ -153,6 +153,7 @@ def report(result: demo.Demo) -> list[str]:
     """The lines of the report."""
     cloud, operator = result.surface.cloud, result.laplacian
     d, n = operator.diagnostics, cloud.n
+    assert d is not None  # freshly built operators have them
     count, tube = np.asarray(d.count), np.asarray(d.tube)
     spacing = float(np.sum(result.areas) / n) ** (1 / (cloud.dim - 1))
     heat, (name, value) = result.heat, result.surface.parameter
@@ -161,37 +162,63 @@ def report(result: demo.Demo) -> list[str]:
         ("surface", result.surface.title),
         ("points", f"{n:,}, {spacing:.3g} apart" + (f", {border} on borders" if border else "")),
         ("method", str(result.method).replace("()", "")),
-        ("stencils", f"{count.min()} / {int(np.median(count))} / {count.max()} points"
-         " (least / median / most)"),
-        ("condition", f"at most {np.max(d.condition):.0f}, moments met to {np.max(d.residual):.0e}"),
-        ("tube", f"folds within the stencil at {int(np.sum(tube > 1)):,} points"
-         f" (support x curvature up to {tube.max():.2f})"),
-        ("spectrum", f"largest modulus {result.spectrum.radius:.4g}, "
-         f"largest real part {result.spectrum.abscissa:.1e}"),
+        (
+            "stencils",
+            f"{count.min()} / {int(np.median(count))} / {count.max()} points"
+            " (least / median / most)",
+        ),
+        (
+            "condition",
+            f"at most {np.max(d.condition):.0f}, moments met to {np.max(d.residual):.0e}",
+        ),
+        (
+            "tube",
+            f"folds within the stencil at {int(np.sum(tube > 1)):,} points"
+            f" (support x curvature up to {tube.max():.2f})",
+        ),
+        (
+            "spectrum",
+            f"largest modulus {result.spectrum.radius:.4g}, "
+            f"largest real part {result.spectrum.abscissa:.1e}",
+        ),
     ]
     for kind, field in result.curvature.items():
         rows.append((f"{kind} curvature", f"{np.min(field):.4g} to {np.max(field):.4g}"))
     rows += [
-        ("heat", f"until t = {heat.until:g} in {heat.steps} steps of Heun's method; hottest "
-         f"{result.peaks[0]:.3g} -> {result.peaks[-1]:.3g}"),
-        ("heat conserved", f"to {result.lost:.1e} (sum over Voronoi cells)"
-         + ("; borders held at their temperature" if border else "")),
+        (
+            "heat",
+            f"until t = {heat.until:g} in {heat.steps} steps of Heun's method; hottest "
+            f"{result.peaks[0]:.3g} -> {result.peaks[-1]:.3g}",
+        ),
+        (
+            "heat conserved",
+            f"to {result.lost:.1e} (sum over Voronoi cells)"
+            + ("; borders held at their temperature" if border else ""),
+        ),
         ("gradient", f"d u(probe, t = {heat.until:g}) / d ({name}) at {value:g}"),
         ("  jax.grad", f"{result.gradient:.10g}"),
-        ("  difference", f"{result.difference:.10g}  (relative difference "
-         f"{result.disagreement:.1e})"),
+        (
+            "  difference",
+            f"{result.difference:.10g}  (relative difference {result.disagreement:.1e})",
+        ),
     ]
     rows += [("note", note) for note in result.notes]
     rows += [("written", str(path)) for path in result.files]
-    lines = [f"jaxsurf {js.__version__}, jax {jax.__version__} on {jax.default_backend()}, "
-             f"{cloud.points.dtype}", ""]
+    lines = [
+        f"jaxsurf {js.__version__}, jax {jax.__version__} on {jax.default_backend()}, "
+        f"{cloud.points.dtype}",
+        "",
+    ]
     lines += [f"{label:<17}{text}" for label, text in rows]
     lines += ["", f"{'seconds':<17}{'compile':>8}{'run':>8}"]
     lines += [f"  {stage:<15}{c:8.1f}{r:8.1f}" for stage, (c, r) in result.seconds.items()]
     c, r = (sum(spent) for spent in zip(*result.seconds.values()))
     lines += [f"  {'total':<15}{c:8.1f}{r:8.1f}"]
     if not result.stable:
-        lines += ["", f"UNSTABLE: the largest |u| went {' -> '.join(f'{p:.3g}' for p in result.peaks)}"]
+        lines += [
+            "",
+            f"UNSTABLE: the largest |u| went {' -> '.join(f'{p:.3g}' for p in result.peaks)}",
+        ]
     if not result.disagreement <= _AGREE:
         lines += ["", "WRONG: the gradient and the difference disagree"]
     return lines

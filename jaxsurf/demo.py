@@ -264,7 +264,7 @@ class Demo:
     areas: Float[Array, " n"]
     source: int
     probe: int
-    influence: Float[Array, " n"]
+    sensitivity: Float[Array, " n"]
     gradient: float
     difference: float
     notes: list[str] = field(default_factory=list)
@@ -353,7 +353,7 @@ def run(
     with stage("gradient"):
         value = jnp.asarray(surface.parameter[1], start.dtype)
         rest = (surface.moved, neighbors, method, heat, probe)
-        gradient, influence = _gradient(value, start, *rest)
+        gradient, sensitivity = _gradient(value, start, *rest)
         step = 1e-4 * value
         above = _temperature_at(value + step, start, *rest)
         below = _temperature_at(value - step, start, *rest)
@@ -369,7 +369,7 @@ def run(
         areas,
         source,
         probe,
-        influence / areas,
+        sensitivity / areas,
         float(gradient),
         float(difference),
         seconds=seconds,
@@ -380,6 +380,15 @@ def run(
     return demo
 
 
+# A gradient further than this from the difference quotient is wrong.
+_AGREE = 1e-4
+
+
+def healthy(demo: Demo) -> bool:
+    """True if the heat never grew and the gradient is that of the difference quotient."""
+    return demo.stable and demo.disagreement <= _AGREE
+
+
 def save(demo: Demo, out: Path) -> list[Path]:
     """The picture and the ParaView file; a warning for what a missing package prevents."""
     files, cloud, t = [], demo.surface.cloud, demo.heat.frames
@@ -387,7 +396,7 @@ def save(demo: Demo, out: Path) -> list[Path]:
         warnings.warn("no picture: pip install 'jaxsurf[pictures]'", stacklevel=2)
     else:
         panels = {f"{name} curvature": values for name, values in demo.curvature.items()}
-        panels["sensitivity of the probe to heat at t = 0"] = demo.influence
+        panels["sensitivity of the probe to heat at t = 0"] = demo.sensitivity
         panels |= {f"heat at t = {s:.3g}": u for s, u in zip(t, demo.temperature)}
         files.append(out / "demo.png")
         plot_fields(cloud, panels, path=files[-1], view=demo.surface.view, up=demo.surface.up)
@@ -396,7 +405,7 @@ def save(demo: Demo, out: Path) -> list[Path]:
     else:
         fields = {f"{name}_curvature": values for name, values in demo.curvature.items()}
         fields |= {f"heat_{i}": u for i, u in enumerate(demo.temperature)}
-        fields |= {"influence": demo.influence, "area": demo.areas}
+        fields |= {"sensitivity": demo.sensitivity, "area": demo.areas}
         if demo.laplacian.diagnostics is not None:
             fields["tube"] = demo.laplacian.diagnostics.tube
         files.append(out / "demo.vtu")

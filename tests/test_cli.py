@@ -1,0 +1,182 @@
+"""The command: its headline numbers, its files, and one line for every mistake."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsurf as js
+from jaxsurf import demo
+from jaxsurf.cli import main
+from jaxsurf.formats import contents_of
+
+_DATA = Path("../shared/data")
+
+
+def run(capsys, *arguments) -> tuple[int, str, str]:
+    code = main(["demo", *map(str, arguments)])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def line(report: str, label: str) -> str:
+    return next(row for row in report.splitlines() if row.startswith(label))
+
+
+def number(report: str, label: str, before: str) -> float:
+    """The number that follows some words in the line of a label."""
+    found = re.search(re.escape(before) + r"\s*(-?[\d.,]+(e[+-]?\d+)?)", line(report, label))
+    return float(found[1].replace(",", ""))
+
+
+def check_files(folder: Path, n: int) -> None:
+    picture = (folder / "demo.png").read_bytes()
+    assert picture.startswith(b"\x89PNG") and len(picture) > 50_000
+    fields = contents_of(folder / "demo.vtu").fields
+    for name in ("mean_curvature", "Gauss_curvature", "heat_0", "heat_2", "sensitivity", "area"):
+        assert fields[name].shape == (n,) and np.isfinite(fields[name]).all()
+    # Heat spreads: its peak falls, nothing is overheated or undercooled by much.
+    assert fields["heat_0"].max() == 1
+    assert fields["heat_2"].max() < 0.5
+    assert fields["heat_2"].min() > -1e-3
+
+
+def test_demo(tmp_path, capsys):
+    code, report, err = run(capsys, "--points", 3_000, "--out", tmp_path)
+    assert code == 0 and err == ""
+    assert "points           3,000" in report
+    assert number(report, "heat conserved", "to") < 5e-3
+    assert number(report, "  difference", "relative difference") < 1e-6
+    # The largest modulus of the fourth-order Laplacian is 4.6 / h² on even points.
+    h = number(report, "points", ", ")
+    assert 3 < number(report, "spectrum", "modulus") * h**2 < 7
+    assert abs(number(report, "spectrum", "real part")) < 1e-3
+    # Gauss curvature of the outer equator of the tori: 1 / (0.4 (1 + 0.4)).
+    assert abs(number(report, "Gauss curvature", "to") - 1 / 0.56) < 0.02
+    # What is not said in the report is not said at all.
+    assert all("bends within one stencil" in row for row in report.splitlines() if "note" in row)
+    check_files(tmp_path, 3_000)
+
+
+@pytest.mark.skipif(not _DATA.is_dir(), reason="no folder ../shared/data with the scans")
+def test_demo_on_a_scan(tmp_path, capsys):
+    # No normals in the file, unused vertices, holes, ears thinner than a stencil.
+    path = _DATA / "stanford-bunny.obj"
+    arguments = ("--surface", path, "--points", 2_000, "--method", "dcpse2", "--out", tmp_path)
+    code, report, err = run(capsys, *arguments)
+    assert code == 0 and err == ""
+    assert "1113 vertices belong to no triangle" in report
+    assert "on borders" in line(report, "points")
+    assert number(report, "  difference", "relative difference") < 1e-6
+    assert number(report, "heat conserved", "to") < 0.1
+    check_files(tmp_path, 2_000)
+
+
+def write_grid(path: Path) -> None:
+    """A wavy rectangle as a mesh, without normals."""
+    m = 40
+    x, y = np.meshgrid(np.linspace(0, 3, m), np.linspace(0, 3, m), indexing="ij")
+    vertices = np.stack([x, y, 0.2 * np.sin(x) * np.cos(y)], axis=-1).reshape(-1, 3)
+    i = (np.arange(m - 1)[:, None] * m + np.arange(m - 1)).ravel()
+    faces = np.concatenate([np.stack(t, 1) for t in ((i, i + m, i + 1), (i + 1, i + m, i + m + 1))])
+    rows = [f"v {a} {b} {c}" for a, b, c in vertices] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
+    path.write_text("\n".join(rows) + "\n")
+
+
+def test_surface_from_file(tmp_path):
+    path = tmp_path / "grid.obj"
+    write_grid(path)
+    own, even = demo.surface_from_file(path, None), demo.surface_from_file(path, 900)
+    assert own.cloud.n == 1_600 and even.cloud.n == 900
+    np.testing.assert_allclose(own.moved(2.0).points, 2 * own.cloud.points)
+    assert int(own.cloud.boundary.sum()) == 4 * 39
+    # A list of points has nothing to resample.
+    cloud = js.sphere(300)
+    js.write(tmp_path / "points.xyz", cloud)
+    assert demo.surface_from_file(tmp_path / "points.xyz", 100).cloud.n == 300
+
+
+def test_spectral_estimate():
+    """Against the dense spectrum, of a stable operator and of one made unstable."""
+    operator = js.laplace_beltrami(js.sphere(500))
+    exact = np.linalg.eigvals(operator.to_scipy().toarray())
+    estimate = demo.spectral_estimate(operator)
+    assert abs(estimate.radius / np.abs(exact).max() - 1) < 0.02
+    assert abs(estimate.abscissa - exact.real.max()) < 1e-6
+    # One row with the wrong sign grows; the estimate must find it.
+    worse = operator.scaled(jnp.ones(500).at[100].set(-1.0))
+    exact = np.linalg.eigvals(worse.to_scipy().toarray()).real.max()
+    assert exact > 10
+    assert abs(demo.spectral_estimate(worse).abscissa / exact - 1) < 0.02
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_cell_areas(dim):
+    cloud = js.sphere(2_000) if dim == 3 else js.circle(200)
+    areas = demo.cell_areas(cloud, js.find_neighbors(cloud, k=20 if dim == 3 else 7))
+    measure = 4 * np.pi if dim == 3 else 2 * np.pi
+    assert abs(float(areas.sum()) / measure - 1) < 2e-3
+    assert float(jnp.std(areas) / jnp.mean(areas)) < 0.02
+    # Second moment of a coordinate: a third (a half) of the measure.
+    moment = float(areas @ cloud.points[:, -1] ** 2) / measure
+    assert abs(moment - 1 / dim) < 1e-3
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--surface", "nowhere.obj"], "nowhere.obj: no such file"),
+        (["--surface", "empty.obj"], "empty.obj: empty file"),
+        (["--surface", "broken.obj"], "broken.obj"),
+        (["--surface", "notes.txt"], "unknown suffix"),
+        (["--time", "-1"], "time = -1.0, expected a positive number"),
+        (["--time", "nan"], "time = nan, expected a positive number"),
+        (["--points", "2"], "n = 2 points, needs at least 4"),
+        (["--points", "40"], "needs at least"),
+        (["--out", "notes.txt"], "notes.txt"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("empty.obj").write_text("")
+    Path("broken.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1\nf 1 2 3\n")
+    Path("notes.txt").write_text("hello\n")
+    code, out, err = run(capsys, *arguments)
+    assert code == 2 and out == ""
+    assert words in err and err.count("\n") == 1
+    assert err.startswith("jaxsurf demo: error: ")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["dance"], ["demo", "--points", "many"], ["demo", "--points", "-5"],
+     ["demo", "--method", "fem"], ["demo", "--points", "all"]],
+)  # fmt: skip
+def test_bad_arguments(arguments, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+    assert "error:" in capsys.readouterr().err
+
+
+def test_module_and_version():
+    command = [sys.executable, "-m", "jaxsurf", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == f"jaxsurf {js.__version__}\n"
+
+
+def test_growth_is_not_healthy():
+    """An unstable run or a wrong gradient must not end with exit code 0."""
+
+    class Result:
+        stable, disagreement = True, 1e-9
+
+    assert demo.healthy(Result)
+    Result.stable = False
+    assert not demo.healthy(Result)
+    Result.stable, Result.disagreement = True, float("nan")
+    assert not demo.healthy(Result)

@@ -11,16 +11,12 @@ FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data"
 _BUNNY = FOLDER / "stanford-bunny.obj"
 
 
-def present() -> bool:
-    return _BUNNY.exists()
-
-
 def bunny(n: int | None = None) -> js.PointCloud:
     """The vertices of the bunny, or n quasi-uniform points on it.
 
     Raises:
         FileNotFoundError: the mesh is absent.
     """
-    if not present():
+    if not _BUNNY.exists():
         raise FileNotFoundError(f"{_BUNNY} is absent: put the Stanford bunny there")
     return read(_BUNNY, n=n)

@@ -133,9 +133,10 @@ def search_neighbors(
     r"""Neighbours within a radius, found on the device, under jit, for points that move.
 
     The same sets in the same order as `find_neighbors`, up to distances that round-off
-    decides. Points are sorted by the cell of a grid that they lie in; each looks into the
-    3^d cells around it. Cells are hashed, so that neither the extent of the cloud nor its
-    distance from the origin matters.
+    decides, and up to sheets of the same orientation across a gap: this search keeps whatever
+    the radius and the normals let in. Points are sorted by the cell of a grid that they lie in;
+    each looks into the 3^d cells around it. Cells are hashed, so that neither the extent of the
+    cloud nor its distance from the origin matters.
 
     Args:
         points: `(n, d)`, d = 2 or 3.

@@ -7,18 +7,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from .checks import (
+    LINK,
+    RINGS,
+    check_count,
+    check_orientation,
+    check_overlap,
+    check_spacing,
+    query,
+    two_sheets,
+)
 from .cloud import PointCloud, is_concrete, raise_at
 
-# Normals more than about 140 degrees apart are opposite: bends that sharp are not resolved.
-_OPPOSITE = -0.75
-# Points used to measure the local spacing: about two rings around a point.
-_RINGS = 13
-# A duplicate is a pair closer than this fraction of the spacing.
-_DUPLICATE = 1e-10
-# Sheets closer than this fraction of the spacing cannot be told apart.
-_GAP = 0.35
+# A way along the surface longer than this times the chord leads around a gap; around a right
+# angle it is at most 1.41.
+_DETOUR = 1.5
 
 
 class Neighbors(eqx.Module):
@@ -60,8 +67,10 @@ def find_neighbors(
 
     Point j is a neighbour of i if it is among the k nearest, or within the radius, of the
     points with $n_i\cdot n_j \ge$ `min_cosine`. The bound on the normals keeps the other side
-    of a thin or folded part out of the neighbourhood. Rows are sorted by distance, equal
-    distances by index.
+    of a thin or folded part out of the neighbourhood. A row that reaches across a gap onto a
+    sheet of the same orientation, as from one toe to the next, keeps only the points that a
+    short way over the surface leads to, in steps of at most two spacings; with k, the next such
+    points take the places of the others. Rows are sorted by distance, equal distances by index.
 
     Args:
         cloud: n points with unit normals; its arrays must be concrete. Points that are
@@ -116,8 +125,13 @@ def find_neighbors(
         reach = np.broadcast_to(np.asarray(radius, points.dtype), cloud.n)
         raise_at(on & ~(reach > 0), "radius of point {i} is {v}, expected a positive number", reach)
         slots, mask = _within(points, normals, tree, reach[rows], capacity, min_cosine, rows)
+    above = two_sheets(points, normals, slots, np.arange(len(rows)))
     if throw:
-        check_overlap(points, normals, slots, names=rows)
+        check_overlap(points, normals, tree, slots, above, names=rows)
+    if above.any():
+        slots, mask = _without_islands(
+            points, normals, tree, slots, mask, above, min_cosine, refill=k is not None
+        )
     indices = np.tile(np.arange(cloud.n, dtype=np.int32)[:, None], slots.shape[1])
     accepted = np.zeros(indices.shape, bool)
     indices[rows] = np.where(mask, rows[slots], indices[rows])
@@ -168,6 +182,11 @@ def nearest_of(
     place = (np.cumsum(on) - 1)[rows[wanted]]
     tree = cKDTree(points.astype(float))
     slots, accepted = nearest(points, normals, tree, k, min_cosine, rows=place)
+    above = two_sheets(points, normals, slots, place)
+    if above.any():
+        slots, accepted = _without_islands(
+            points, normals, tree, slots, accepted, above, min_cosine, rows=place
+        )
     indices, mask = np.tile(rows[:, None].astype(np.int32), k), np.zeros((len(rows), k), bool)
     indices[wanted], mask[wanted] = names[slots], accepted
     return indices, mask
@@ -184,7 +203,7 @@ def nearest(points, normals, tree, k: int, min_cosine: float, *, rows=None):
     most = min(n, max(8 * k, 64))
     while todo.size:
         centre = rows[todo]
-        found = _query(tree, points[centre], count)
+        found = query(tree, points[centre], count)
         key, accepted = _judge(points, normals, centre[:, None], found, min_cosine)
         # Beyond the farthest candidate there may be others at the same distance.
         sure = np.sum(accepted & (key < key.max(axis=1, keepdims=True)), axis=1) >= k
@@ -231,121 +250,61 @@ def _within(points, normals, tree, radius, capacity, min_cosine: float, names):
     return slots, mask
 
 
+def _without_islands(
+    points, normals, tree, slots, mask, above, min_cosine: float, *, rows=None, refill=True
+):
+    """Take out what lies across a gap, on another sheet of the same orientation.
+
+    Only rows that hold a point `above` their own are changed. They keep what a short way over
+    the surface leads to, and are refilled from twice as many candidates.
+    """
+    rows = np.arange(len(points)) if rows is None else rows
+    held = np.flatnonzero(above.any(axis=1))
+    slots, mask = slots.copy(), mask.copy()
+    wide, admitted, k = slots[held], mask[held], slots.shape[1]
+    if refill:
+        most = min(len(points), 2 * k)
+        wide, admitted = nearest(points, normals, tree, most, min_cosine, rows=rows[held])
+    members = np.unique(wide)
+    links = _links(points, normals, tree, members, min_cosine)
+    for i, candidates, good in zip(held, wide, admitted, strict=True):
+        found = candidates[good]
+        place = np.searchsorted(members, found)
+        way = dijkstra(links[place][:, place], directed=False, indices=0)
+        chord = np.linalg.norm(points[found] - points[rows[i]], axis=1)
+        kept = found[way <= _DETOUR * chord][:k]
+        slots[i], mask[i] = rows[i], np.arange(k) < kept.size
+        slots[i, : kept.size] = kept
+    return slots, mask
+
+
+def _links(points, normals, tree, members, min_cosine: float) -> csr_array:
+    """Lengths of the steps over the surface between members that are close to each other."""
+    count = min(len(points), 2 * RINGS)
+    near, used = nearest(points, normals, tree, count, min_cosine, rows=members)
+    d = points[near] - points[members][:, None]
+    length = np.linalg.norm(d, axis=2)
+    # A chord of a smooth curve makes equal angles with the normals at its ends.
+    both = normals[near] + normals[members][:, None]
+    along = np.abs(np.einsum("nkd,nkd->nk", d, both)) <= 0.5 * length * np.linalg.norm(both, axis=2)
+    place = np.minimum(np.searchsorted(members, near), len(members) - 1)
+    reach = LINK * length[:, [min(_ring_size(points), count) - 1]]
+    step = used & along & (members[place] == near) & (length > 0) & (length <= reach)
+    entries = (length[step], (np.nonzero(step)[0], place[step]))
+    return csr_array(entries, shape=(len(members), len(members)))
+
+
+def _ring_size(points: np.ndarray) -> int:
+    """A point and its closest neighbours: two of a curve, four of a surface."""
+    return 2 * points.shape[1] - 1
+
+
 def _judge(points, normals, row, found, min_cosine: float):
     """Distance key of each candidate, and whether its normal lets it in."""
     d = points[found] - points[row]
     key = distance_key(np.einsum("...d,...d->...", d, d))
     cosine = np.einsum("...d,...d->...", normals[found], normals[row])
     return key, cosine >= min_cosine - cosine_slack(points.dtype)
-
-
-def _query(tree: cKDTree, points: np.ndarray, count: int) -> np.ndarray:
-    """Indices of the `count` nearest points, `(n, count)`."""
-    return tree.query(points, np.arange(1, count + 1), workers=-1)[1]
-
-
-# --- what is wrong with a cloud ------------------------------------------------------------
-
-
-def check_count(k: int, n: int) -> None:
-    if k < 2:
-        raise ValueError(f"k = {k} neighbours; the point itself counts, so at least 2 are needed")
-    if n < k:
-        raise ValueError(f"too few points: {n}, with k = {k} neighbours at least {k} are needed")
-
-
-def check_spacing(points: np.ndarray, tree: cKDTree, *, names: np.ndarray) -> None:
-    """Raise if two points coincide."""
-    if len(points) < 2:
-        raise ValueError(f"too few points: {len(points)}, at least 2 are needed")
-    distance = tree.query(points, [2], workers=-1)[0][:, 0]
-    where = np.flatnonzero(distance <= _DUPLICATE * np.median(distance))
-    if where.size:
-        i = where[0]
-        j = next(j for j in tree.query(points[i], 2)[1] if j != i)
-        raise ValueError(
-            f"points {names[i]} and {names[j]} coincide (distance {distance[i]:.3g}, "
-            f"spacing {np.median(distance):.3g}); {where.size} points have a duplicate"
-        )
-
-
-def check_orientation(
-    points: np.ndarray,
-    normals: np.ndarray,
-    tree: cKDTree,
-    *,
-    names: np.ndarray,
-    message: str = "mixed orientation: neighbouring points {i} and {j} of one sheet "
-    "have opposite normals (cosine {c:.2f})",
-) -> None:
-    r"""Raise if normals change side within a sheet, or if two sheets are too close.
-
-    A neighbour with the opposite normal lies either on another sheet, or on the same sheet and
-    then one of the two normals is flipped. On another sheet it is displaced along the
-    normal, or my own sheet goes on underneath it. A flipped point is displaced along the
-    tangent and none of my own orientation is near it.
-    """
-    count = min(len(points), _RINGS)
-    found = _query(tree, points, count)
-    opposite = np.einsum("nd,nkd->nk", normals, normals[found]) < _OPPOSITE
-    rows = np.flatnonzero(opposite.any(axis=1))
-    if not rows.size:
-        return
-    found, opposite = found[rows], opposite[rows]
-    d = points[found] - points[rows][:, None]
-    distance = np.linalg.norm(d, axis=2)
-    height = np.abs(np.einsum("nkd,nd->nk", d, normals[rows]))
-    same = np.einsum("nd,nkd->nk", normals[rows], normals[found]) > 0.5
-    spacing = _spacing_from_count(distance[:, -1], count, points.shape[1])
-    # Spacing of my own sheet: by count, unless there is a border, which leaves half a ring empty.
-    second = np.sort(np.where(same, distance, distance[:, -1:]), axis=1)[:, min(2, count - 1)]
-    counted = _spacing_from_count(distance[:, -1], same.sum(axis=1), points.shape[1])
-    sheet = np.minimum(second, counted)
-    flat = opposite & (height <= 0.3 * distance) & (distance <= 1.5 * spacing[:, None])
-    # Nearest point of my own orientation to each candidate, over the tangent plane.
-    flat_d = d - np.einsum("nkd,nd->nk", d, normals[rows])[..., None] * normals[rows][:, None]
-    apart = np.linalg.norm(flat_d[:, :, None] - flat_d[:, None], axis=3)
-    mine = same.copy()
-    mine[:, 0] = False
-    covered = (np.where(mine[:, None, :], apart, np.inf).min(axis=2)) < 0.5 * distance
-    flipped = flat & ~covered
-    # One such neighbour may be noise at a sharp fold; a seam shows several at a surface point.
-    flipped &= flipped.sum(axis=1, keepdims=True) >= points.shape[1] - 1
-    if flipped.any():
-        r, c = np.argwhere(flipped)[0]
-        i, j = rows[r], found[r, c]
-        raise ValueError(message.format(i=names[i], j=names[j], c=normals[i] @ normals[j]))
-    beside = np.sqrt(np.maximum(distance**2 - height**2, 0))
-    close = opposite & (height < _GAP * sheet[:, None]) & (beside < 0.75 * sheet[:, None])
-    if close.any():
-        r, c = np.argwhere(close)[0]
-        raise ValueError(
-            f"two sheets too close to be told apart at points {names[rows[r]]} and "
-            f"{names[found[r, c]]}: gap {height[r, c]:.3g}, spacing {sheet[r]:.3g}, "
-            f"a gap of at least {_GAP * sheet[r]:.3g} is needed"
-        )
-
-
-def check_overlap(
-    points: np.ndarray, normals: np.ndarray, slots: np.ndarray, *, names: np.ndarray
-) -> None:
-    """Raise if a neighbourhood holds two sheets of the same orientation, one above the other.
-
-    Their normals agree, so that the bound on the normals cannot keep them apart.
-    """
-    for slot in slots.T:  # one slot at a time: the (n, k, d) arrays are large
-        d = points[slot] - points
-        distance = np.linalg.norm(d, axis=1)
-        rise = np.minimum(*(np.abs(np.einsum("nd,nd->n", d, m)) for m in (normals, normals[slot])))
-        parallel = np.einsum("nd,nd->n", normals, normals[slot]) > 0.9
-        above = np.flatnonzero(parallel & (rise > 0.9 * distance) & (distance > 0))
-        if above.size:
-            i = above[0]
-            raise ValueError(
-                f"points {names[i]} and {names[slot[i]]} lie on two sheets of the same "
-                f"orientation, {distance[i]:.3g} apart: their normals cannot tell them apart, "
-                "use a smaller neighbourhood or more points"
-            )
 
 
 def tube_ratio(cloud: PointCloud, neighbors: Neighbors) -> Float[Array, " n"]:
@@ -382,9 +341,3 @@ def tube_ratio(cloud: PointCloud, neighbors: Neighbors) -> Float[Array, " n"]:
 
     ratios = jax.lax.map(lambda column: bend(*column), (neighbors.indices.T, neighbors.mask.T))
     return jnp.max(ratios, axis=0)
-
-
-def _spacing_from_count(reach: np.ndarray, count, dim: int) -> np.ndarray:
-    """Spacing h of a sheet that has `count` points within `reach`."""
-    volume = 2 * reach if dim == 2 else np.pi * reach**2
-    return (volume / count) ** (1 / (dim - 1))

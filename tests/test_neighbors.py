@@ -1,13 +1,21 @@
 """Neighbour searches: the sets themselves, both searches against each other, bad clouds."""
 
+import warnings
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from jaxsurf.cells import SearchCapacity, allocate, search_neighbors
+from jaxsurf.checks import two_sheets
 from jaxsurf.cloud import PointCloud
-from jaxsurf.neighbors import find_neighbors, nearest_of, tube_ratio
+from jaxsurf.io import read
+from jaxsurf.neighbors import find_neighbors, nearest, nearest_of, tube_ratio
+
+ARMADILLO = Path(__file__).parents[2] / "shared" / "data" / "armadillo.obj"
 
 
 def fibonacci(n):
@@ -328,7 +336,7 @@ def test_half_flipped_surfaces_are_refused():
         find_neighbors(PointCloud(circle, circle * np.where(angle < 3, 1, -1)[:, None]), 5)
 
 
-@pytest.mark.parametrize("gap", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("gap", [0.12, 0.2, 0.3, 0.5, 1.0, 2.0])
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.5, 0.5), (0.3, 0.1)])
 def test_thin_plates_are_accepted(gap, shift):
     x, normals = plates(gap, shift)
@@ -336,7 +344,7 @@ def test_thin_plates_are_accepted(gap, shift):
     assert bool(find_neighbors(PointCloud(x, -normals), 20).mask.all())
 
 
-@pytest.mark.parametrize("gap", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("gap", [0.3, 0.5, 1.0, 2.0])
 def test_concentric_spheres(gap):
     h = spacing(1000)
     inner = fibonacci(1000)
@@ -353,12 +361,103 @@ def test_concentric_spheres(gap):
     assert find_neighbors(parallel, 20, throw=False).k == 20
 
 
-@pytest.mark.parametrize("gap", [0.05, 0.2, 0.3])
+@pytest.mark.parametrize("gap", [0.0, 0.02, 0.08])
 def test_sheets_too_close_are_refused(gap):
     for shift in [(0.0, 0.0), (0.5, 0.5), (0.3, 0.1)]:
         x, normals = plates(gap, shift)
-        with pytest.raises(ValueError, match=r"too close to be told apart|mixed orientation"):
+        with pytest.raises(ValueError, match=r"too close to be told|mixed orientation|coincide"):
             find_neighbors(PointCloud(x, normals), 20)
+
+
+def test_flipped_points_of_thin_and_rough_sheets_are_named():
+    x, normals = plates(0.2, (0.5, 0.5))
+    normals[210] *= -1
+    with pytest.raises(ValueError, match=r"\b210\b"):
+        find_neighbors(PointCloud(x, normals), 12)
+    rough = fibonacci(1000) * (1 + 0.1 * spacing(1000) * random_sphere(1000)[:, :1])
+    normals = fibonacci(1000)
+    find_neighbors(PointCloud(rough, normals), 12)
+    for axis in np.eye(3):
+        half = normals * np.where(normals @ axis > 0.01, 1, -1)[:, None]
+        with pytest.raises(ValueError, match="mixed orientation"):
+            find_neighbors(PointCloud(rough, half), 12)
+
+
+def toes(gap, floor=False, thick=2.0, m=20):
+    """Two slabs side by side on a lattice, and the ground that joins them if `floor`."""
+    a = np.stack(np.meshgrid(np.arange(m), np.arange(m), indexing="ij"), -1).reshape(-1, 2)
+    faces = [0, thick, thick + gap, 2 * thick + gap]
+    x = np.concatenate([np.c_[np.full(m * m, f), a + 0.01 * i] for i, f in enumerate(faces)])
+    normals = np.repeat([-1.0, 1.0, -1.0, 1.0], m * m)[:, None] * [1.0, 0.0, 0.0]
+    sheet = np.repeat(np.arange(4), m * m)
+    if floor:
+        g = np.stack(np.meshgrid(np.arange(thick + 1, faces[3]), np.arange(m)), -1).reshape(-1, 2)
+        x = np.r_[x, np.c_[g, np.full(len(g), -1.0)]]
+        normals = np.r_[normals, np.tile([0.0, 0.0, 1.0], (len(g), 1))]
+        sheet = np.r_[sheet, np.full(len(g), 4)]
+    return x, normals, sheet
+
+
+@pytest.mark.parametrize("gap", [1.0, 2.0, 3.0])
+@pytest.mark.parametrize("thick", [1.5, 2.0])
+def test_next_toe_is_rejected(gap, thick):
+    """Right sides of two toes face the same way: only the gap keeps them apart."""
+    x, normals, sheet = toes(gap, thick=thick)
+    cloud = PointCloud(x, normals)
+    neighbors = find_neighbors(cloud, 66)
+    assert bool(neighbors.mask.all())  # filled up with further points of the same side
+    assert np.all(sheet[np.asarray(neighbors.indices)] == sheet[:, None])
+    row = 400 + 10 * 20 + 10
+    d = np.linalg.norm(x - x[row], axis=1)
+    own = [j for j in np.lexsort((np.arange(len(x)), np.round(d, 9))) if sheet[j] == 1]
+    assert set(neighbors.indices[row].tolist()[:60]) <= set(own[:66])
+    rows = np.array([row, 3, 1555])
+    indices, mask = nearest_of(cloud, rows, 66)
+    assert np.array_equal(indices, neighbors.indices[rows])
+    assert np.array_equal(mask, neighbors.mask[rows])
+
+    within = find_neighbors(cloud, radius=5.6)
+    held, found = np.asarray(within.mask), np.asarray(within.indices)
+    assert np.all(sheet[found] == sheet[:, None])
+    assert set(found[row][held[row]]) == {j for j in own if d[j] <= 5.6}
+
+
+def test_next_toe_is_rejected_though_the_ground_joins_them():
+    x, normals, sheet = toes(2.0, floor=True)
+    neighbors = find_neighbors(PointCloud(x, normals), 66)
+    found = sheet[np.asarray(neighbors.indices)]
+    right = (sheet == 1) & (x[:, 2] > 2)
+    # At that height the ground is a detour of at least 10 for 4.
+    assert np.all(found[right] != 3)
+    low = np.flatnonzero((sheet == 1) & (x[:, 2] < 1))
+    assert np.any(found[low] == 4)  # the ground itself stays
+
+
+def test_parallel_spheres_are_kept_apart_by_a_gap():
+    size = 1 + 3.2 * spacing(1000)
+    inner, outer = fibonacci(1000), fibonacci(int(1000 * size**2))
+    points, normals = np.r_[inner, size * outer], np.r_[inner, outer]
+    sheet = np.arange(len(points)) < 1000
+    neighbors = find_neighbors(PointCloud(points, normals), 50)
+    assert bool(neighbors.mask.all())
+    assert np.all(sheet[np.asarray(neighbors.indices)] == sheet[:, None])
+
+
+@pytest.mark.skipif(not ARMADILLO.exists(), reason="armadillo.obj is not in ../shared/data")
+def test_toes_of_the_armadillo():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a few points allow no fit
+        cloud = read(ARMADILLO, n=10_000)
+    neighbors = find_neighbors(cloud, 66)
+    assert bool(neighbors.mask.all())
+    x, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+
+    def crossings(lists):
+        return int(two_sheets(x, normals, np.asarray(lists), np.arange(cloud.n)).sum())
+
+    slots, _ = nearest(x, normals, cKDTree(x), 66, 0.0)
+    assert crossings(slots) > 150
+    assert crossings(neighbors.indices) < 40  # steep steps of one side: a short way leads there
 
 
 def test_tube_ratio_is_the_largest_curvature():

@@ -31,6 +31,7 @@ from .neighbors import Neighbors
 from .operators import choose_neighbors, laplace_beltrami
 from .plot import plot_fields
 from .shapes.implicit import double_torus, level_set, level_set_normals, project_to_level_set
+from .spectrum import Spectrum, spectral_estimate
 from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil
 
@@ -96,77 +97,6 @@ def surface_from_file(path: str | Path, n: int | None = 10_000) -> Surface:
 
 def _scaled(cloud: PointCloud, scale: Float[Array, ""]) -> PointCloud:
     return eqx.tree_at(lambda c: c.points, cloud, scale * cloud.points)
-
-
-# --- spectrum ------------------------------------------------------------------------------
-
-
-class Spectrum(NamedTuple):
-    """Outer eigenvalues of an operator: largest modulus, largest real part."""
-
-    radius: float
-    abscissa: float
-
-
-def spectral_estimate(operator: Stencil, *, steps: int = 40, degree: int = 24) -> Spectrum:
-    r"""Largest modulus and largest real part of an operator's eigenvalues, by Arnoldi's method.
-
-    The modulus from the Krylov space of the operator A. The real part from that of a Chebyshev
-    polynomial of A, which is at most 1 on the left 98 per cent of $[-\rho, 0]$ and grows steeply
-    from there to the right: slow and growing modes stand out. In both, the eigenvalues are those
-    of A projected on the space. On a closed surface the largest real part is that of the
-    constants, zero; a positive one is a mode that grows.
-
-    Args:
-        operator: takes and gives scalar fields.
-        steps: dimension of the spaces.
-        degree: of the polynomial.
-    """
-    start = np.random.default_rng(0).normal(size=operator.n)
-    steps = min(steps, operator.n - 1)
-    radius, abscissa = _spectrum(
-        operator, jnp.asarray(start, operator.weights.dtype), steps, degree
-    )
-    return Spectrum(float(jnp.abs(jnp.asarray(radius)).max()), float(abscissa.real.max()))
-
-
-@eqx.filter_jit
-def _spectrum(operator, start, steps: int, degree: int):
-    outer = _projected_eigenvalues(operator, _krylov_space(operator, start, steps))
-    radius = jnp.max(jnp.abs(outer))
-
-    center, half = 0.51 * radius, 0.49 * radius
-
-    def shifted(v):
-        return (operator(v) + center * v) / half
-
-    def chebyshev(v):
-        def recur(pair, _):
-            last, now = pair
-            return (now, 2 * shifted(now) - last), None
-
-        return jax.lax.scan(recur, (v, shifted(v)), length=degree - 1)[0][1]
-
-    return radius, _projected_eigenvalues(operator, _krylov_space(chebyshev, start, steps // 2))
-
-
-def _krylov_space(apply, start, steps: int):
-    """Orthonormal rows that span start, A start, ..., A^steps start."""
-    space = (
-        jnp.zeros((steps + 1, start.size), start.dtype).at[0].set(start / jnp.linalg.norm(start))
-    )
-
-    def extend(space, j):
-        v = apply(space[j])
-        for _ in range(2):  # twice is enough (Gram-Schmidt)
-            v = v - space.T @ (space @ v)
-        return space.at[j + 1].set(v / jnp.linalg.norm(v)), None
-
-    return jax.lax.scan(extend, space, jnp.arange(steps))[0]
-
-
-def _projected_eigenvalues(operator, space):
-    return jnp.linalg.eigvals(space @ operator(space.T))
 
 
 # --- heat ----------------------------------------------------------------------------------

@@ -264,7 +264,7 @@ def run(
         surface = sample()
         cloud = surface.cloud
     with stage("neighbours"):
-        neighbors = _neighbors(cloud, method)
+        neighbors = choose_neighbors(cloud, method=method)
     with stage("operator"):
         laplacian = laplace_beltrami(cloud, neighbors, method=method)
         jax.block_until_ready(laplacian.weights)
@@ -341,19 +341,6 @@ def save(demo: Demo, out: Path) -> list[Path]:
         files.append(out / "demo.vtu")
         write(files[-1], cloud, fields)
     return files
-
-
-def _neighbors(cloud: PointCloud, method: AbstractMethod) -> Neighbors:
-    """Neighbours also where thin parts are sampled coarsely, which is then said."""
-    try:
-        return choose_neighbors(cloud, method=method)
-    except ValueError as error:
-        # Normals keep two sheets apart as far as they differ; whether that is enough shows in
-        # the spectrum and in the heat. Any other complaint is one about the input.
-        if "two sheets" not in str(error):
-            raise
-        warnings.warn(f"thin parts, taken as they are: {error}", stacklevel=2)
-        return choose_neighbors(cloud, method=method, throw=False)
 
 
 def _temperature_at(value, start, moved, neighbors, method, heat: Heat, probe: int):

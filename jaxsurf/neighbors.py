@@ -55,7 +55,7 @@ class Neighbors(eqx.Module):
 
 
 def find_neighbors(
-    cloud: PointCloud,
+    cloud: PointCloud | Float[Array, "n d"],
     k: int | None = None,
     *,
     radius: float | Float[Array, " n"] | None = None,
@@ -74,7 +74,8 @@ def find_neighbors(
 
     Args:
         cloud: n points with unit normals; its arrays must be concrete. Points that are
-            switched off are nobody's neighbour and have no neighbours.
+            switched off are nobody's neighbour and have no neighbours. Or bare points
+            `(n, d)` of flat space, where there are no sheets to tell apart.
         k: number of neighbours, the point itself included. Give this or `radius`.
         radius: neighbours are at most this far away, in the units of `points`; one number or
             one per point.
@@ -109,6 +110,9 @@ def find_neighbors(
         )
     if k is not None and capacity is not None:
         raise ValueError("capacity belongs to a search by radius; with k the rows have k slots")
+    surface = isinstance(cloud, PointCloud)
+    if not isinstance(cloud, PointCloud):
+        cloud = PointCloud(cloud, jnp.zeros_like(cloud).at[:, 0].set(1))
     on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
     rows = np.flatnonzero(on)
     points = np.asarray(cloud.points)[rows]
@@ -117,7 +121,7 @@ def find_neighbors(
         check_count(k, len(rows))
     tree = cKDTree(points.astype(float))
     check_spacing(points, tree, names=rows)
-    if throw:
+    if surface and throw:
         check_orientation(points, normals, tree, names=rows)
     if k is not None:
         slots, mask = nearest(points, normals, tree, k, min_cosine)
@@ -125,13 +129,14 @@ def find_neighbors(
         reach = np.broadcast_to(np.asarray(radius, points.dtype), cloud.n)
         raise_at(on & ~(reach > 0), "radius of point {i} is {v}, expected a positive number", reach)
         slots, mask = _within(points, normals, tree, reach[rows], capacity, min_cosine, rows)
-    above = two_sheets(points, normals, slots, np.arange(len(rows)))
-    if throw:
-        check_overlap(points, normals, tree, slots, above, names=rows)
-    if above.any():
-        slots, mask = _without_islands(
-            points, normals, tree, slots, mask, above, min_cosine, refill=k is not None
-        )
+    if surface:
+        above = two_sheets(points, normals, slots, np.arange(len(rows)))
+        if throw:
+            check_overlap(points, normals, tree, slots, above, names=rows)
+        if above.any():
+            slots, mask = _without_islands(
+                points, normals, tree, slots, mask, above, min_cosine, refill=k is not None
+            )
     indices = np.tile(np.arange(cloud.n, dtype=np.int32)[:, None], slots.shape[1])
     accepted = np.zeros(indices.shape, bool)
     indices[rows] = np.where(mask, rows[slots], indices[rows])

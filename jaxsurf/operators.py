@@ -276,14 +276,12 @@ def partial_derivative(
     dim = points.shape[-1]
     if len(alpha) != dim or min(alpha) < 0 or sum(alpha) < 1:
         raise ValueError(f"alpha = {alpha} is no derivative in {dim} dimensions")
-    # In flat space all directions are alike; the constant normals only serve the search.
-    normals = jnp.zeros_like(points).at[:, -1].set(1)
-    cloud = PointCloud(points, normals)
     target = Partial(tuple(alpha))
     if neighbors is None:
-        neighbors = find_neighbors(
-            cloud, min(method.neighbor_count(dim, target), len(points)), throw=False
-        )
+        count = min(method.neighbor_count(dim, target), len(points))
+        neighbors = find_neighbors(points, count)
+    # The method looks at offsets only; the normals are there for the form.
+    cloud = PointCloud(points, jnp.zeros_like(points).at[:, 0].set(1))
     return _build(cloud, neighbors, method, target, throw)
 
 

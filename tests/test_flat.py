@@ -56,8 +56,7 @@ def test_odd_operators_are_conservative_on_symmetric_points():
     """On a grid the weights are odd: central differences, without the centre."""
     axis = np.arange(9.0)
     points = jnp.asarray(np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2))
-    cloud = js.PointCloud(points, jnp.zeros_like(points).at[:, 0].set(1))
-    whole_shells = js.find_neighbors(cloud, k=21, throw=False)
+    whole_shells = js.find_neighbors(points, k=21)
     operator = js.partial_derivative(points, (1, 0), neighbors=whole_shells)
     middle = operator.weights[:, 40]
     offsets = points[operator.indices[:, 40]] - points[40]
@@ -68,8 +67,7 @@ def test_odd_operators_are_conservative_on_symmetric_points():
 
 def test_derivative_in_points():
     points = square(8)
-    cloud = js.PointCloud(points, jnp.zeros_like(points).at[:, 0].set(1))
-    neighbors = js.find_neighbors(cloud, k=30, throw=False)
+    neighbors = js.find_neighbors(points, k=30)
     u = jnp.sin(points[:, 0] * 3 + points[:, 1])
 
     def total(points):

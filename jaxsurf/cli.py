@@ -129,10 +129,11 @@ def _progress(stages: int) -> Iterator:
             bar.refresh()
 
     def tell(name: str):
-        bar.update(0 if first.pop() else 1) if first else bar.update()
+        bar.update(begun.is_set())
+        begun.set()
         bar.set_description_str(name)
 
-    first = [True]
+    begun = threading.Event()
     clock = threading.Thread(target=tick, daemon=True)
     clock.start()
     try:
@@ -141,6 +142,11 @@ def _progress(stages: int) -> Iterator:
         over.set()
         clock.join()
         bar.close()
+
+
+def _named(method: js.AbstractMethod) -> str:
+    number = "degree" if isinstance(method, js.GFDM) else "order"
+    return f"{type(method).__name__}({number}={getattr(method, number)})"
 
 
 # --- the report ----------------------------------------------------------------------------
@@ -158,7 +164,7 @@ def report(result: demo.Demo) -> list[str]:
     rows = [
         ("surface", result.surface.title),
         ("points", f"{n:,}, {spacing:.3g} apart" + (f", {border} on borders" if border else "")),
-        ("method", str(result.method).replace("()", "")),
+        ("method", _named(result.method)),
         (
             "stencils",
             f"{count.min()} / {int(np.median(count))} / {count.max()} points"
@@ -166,7 +172,7 @@ def report(result: demo.Demo) -> list[str]:
         ),
         (
             "condition",
-            f"at most {np.max(d.condition):.0f}, moments met to {np.max(d.residual):.0e}",
+            f"at most {np.max(d.condition):.3g}, moments met to {np.max(d.residual):.0e}",
         ),
         (
             "tube",

@@ -214,8 +214,8 @@ def refit_normals(
         settled normals, three iterations have the derivative of the settled normals to 1e-6
         (`tests/test_frames.py::test_refit_derivative`).
     Raises:
-        ValueError: too few neighbours for the degree, named by index with both numbers (on
-            concrete lists; under jit only k is checked).
+        ValueError: too few neighbours for the degree, named by index with both numbers; a
+            normal turned over by its fit (on concrete arrays; under jit only k is checked).
 
     Example:
         >>> angle = 2 * jnp.pi * jnp.arange(100) / 100
@@ -240,7 +240,16 @@ def refit_normals(
         radius = jnp.broadcast_to(jnp.asarray(radius, points.dtype), n)
     i = jnp.arange(n)
     slots, accepted = neighbors.indices, neighbors.mask
-    return _refit(points, i, normals, slots, accepted, radius, degree, iterations, batch_size)[0]
+    fitted = _refit(points, i, normals, slots, accepted, radius, degree, iterations, batch_size)[0]
+    if is_concrete(fitted, neighbors.mask):
+        cosine = np.sum(np.asarray(fitted) * np.asarray(normals), axis=1)
+        raise_at(
+            np.asarray(neighbors.mask[:, 0]) & ~(cosine > 0),
+            "the fit turned the normal of point {i} over (cosine {v:.2f} with the one given): "
+            "the points do not resolve the surface there, use more points or a lower degree",
+            cosine,
+        )
+    return fitted
 
 
 def _check_fit(k: int, degree: int, needed: int) -> None:

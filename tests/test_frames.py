@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxsurf as js
 from jaxsurf.cloud import PointCloud
 from jaxsurf.frames import estimate_normals, from_points, refit_normals, tangent_frames
 from jaxsurf.neighbors import Neighbors, find_neighbors
@@ -386,3 +387,12 @@ def test_resolved_surfaces_do_not_warn():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         estimate_normals(ellipsoid(1000)[0])
+
+
+def test_a_normal_that_its_fit_turns_over():
+    """Noise far above what the points resolve: named, not returned."""
+    x = np.asarray(js.sphere(300).points)
+    rough = x * (1 + 0.3 * np.random.default_rng(0).uniform(-1, 1, (300, 1)))
+    neighbors = find_neighbors(PointCloud(x, x), 24)
+    with pytest.raises(ValueError, match=r"turned the normal of point \d+ over \(cosine -"):
+        refit_normals(jnp.asarray(rough), jnp.asarray(x), neighbors, degree=4)

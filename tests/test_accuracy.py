@@ -71,3 +71,25 @@ def test_sphere_with_the_papers_parameters(order, spacings, bound):
     z = cloud.points[:, 2]
     u = 3 / 16 / jnp.sqrt(jnp.pi) * (35 * z**4 - 30 * z**2 + 3)
     assert jnp.abs(laplacian(u) + 20 * u).max() < bound
+
+
+def test_layers_of_the_papers_default():
+    """Mean distance between layers: enough at order 2, not at order 4, where ours are denser."""
+    cloud = jittered_sphere(2000)
+    u, _, exact = exponential(cloud.points)
+    errors = {}
+    for order in (2, 4):
+        method = js.DCPSE(order=order)
+        neighbors = js.find_neighbors(cloud, k=method.neighbor_count(3))
+        ours = js.laplace_beltrami(cloud, neighbors, method=method)
+        support = ours.diagnostics.support[:, None]
+        distance = jnp.linalg.norm(cloud.points[neighbors.indices] - cloud.points[:, None], axis=2)
+        inside = (distance > 0) & (distance < support)
+        mean = float(jnp.sum(distance * inside) / jnp.sum(inside))
+        paper = js.DCPSE(
+            order=order, layer_spacing=mean, layers=round(float(support.mean()) / mean)
+        )
+        theirs = js.laplace_beltrami(cloud, neighbors, method=paper, throw=False)
+        errors[order] = [relative_error(operator(u), exact) for operator in (ours, theirs)]
+    assert errors[2][1] < 1.1 * errors[2][0] < 1.3e-2
+    assert errors[4][0] < 2e-4 and errors[4][1] > 0.1

@@ -78,6 +78,7 @@ def _picture(path: Path, spectra, cases) -> None:
             ax.axvline(0, color="0.6", linewidth=0.8)
             ax.plot(values.real, values.imag, ".", markersize=2)
             ax.tick_params(labelsize=6)
+            ax.locator_params(axis="x", nbins=4)
             ax.set_title(f"{name}, {method_name(method)}", fontsize=7)
     figure.supxlabel("real part", fontsize=9)
     figure.supylabel("imaginary part", fontsize=9)

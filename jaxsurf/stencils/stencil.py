@@ -156,6 +156,12 @@ class Stencil(AbstractOperator):
         """The operator with row i multiplied by `factor[i]`."""
         return eqx.tree_at(lambda s: s.weights, self, self.weights * factor)
 
+    def shifted(self, term: Float[Array, " n"] | float) -> Stencil:
+        """The operator plus `term[i]` times the value at point i: the identity times a number."""
+        if self.in_shape or self.out_shape:
+            raise ValueError("only an operator from scalar fields to scalar fields has a shift")
+        return eqx.tree_at(lambda s: s.weights, self, self.weights.at[0].add(term))
+
     def save(self, path: str | Path) -> None:
         """Write indices and weights to a NumPy archive (`.npz`, no pickle)."""
         data = {

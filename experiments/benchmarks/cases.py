@@ -90,6 +90,9 @@ def build_beside_numpy(degree: int, k: int, n: int) -> dict:
         lambda: numpy_gfdm(points, normals, index, degree),
         5,
     )
+    weights = _laplacian(cloud, neighbors, js.GFDM(degree=degree)).weights
+    expected = numpy_gfdm(points, normals, index, degree)
+    np.testing.assert_allclose(weights.T, expected, rtol=1e-6, atol=1e-8 * np.abs(expected).max())
     return {"ours s": ours, "NumPy s": theirs, "NumPy / ours": 1 / ratio}
 
 

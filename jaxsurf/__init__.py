@@ -3,11 +3,21 @@
 Points, then neighbours, then stencils, then operators: `import jaxsurf as js`.
 """
 
+from .borders import Border as Border
+from .borders import border_conormals as border_conormals
+from .borders import detect_border as detect_border
+from .borders import find_border as find_border
+from .boundary import Closure as Closure
+from .boundary import close as close
 from .build import choose_neighbors as choose_neighbors
 from .cells import SearchCapacity as SearchCapacity
 from .cells import allocate as allocate
 from .cells import search_neighbors as search_neighbors
 from .cloud import PointCloud as PointCloud
+from .conditions import Condition as Condition
+from .conditions import dirichlet as dirichlet
+from .conditions import neumann as neumann
+from .conditions import robin as robin
 from .curvature import gauss_curvature as gauss_curvature
 from .curvature import mean_curvature as mean_curvature
 from .curvature import mean_curvature_vector as mean_curvature_vector
@@ -17,6 +27,7 @@ from .frames import estimate_normals as estimate_normals
 from .frames import from_points as from_points
 from .frames import refit_normals as refit_normals
 from .frames import tangent_frames as tangent_frames
+from .ghosts import with_ghosts as with_ghosts
 from .io import read as read
 from .io import read_fields as read_fields
 from .io import write as write
@@ -59,5 +70,19 @@ from .stencils.method import Diagnostics as Diagnostics
 from .stencils.stencil import AbstractOperator as AbstractOperator
 from .stencils.stencil import Composition as Composition
 from .stencils.stencil import Stencil as Stencil
+from .time.explicit import RKC2 as RKC2
+from .time.implicit import IMEX as IMEX
+from .time.implicit import SDIRK as SDIRK
+from .time.integrate import IntegrationError as IntegrationError
+from .time.integrate import choose_solver as choose_solver
+from .time.integrate import integrate as integrate
+from .time.integrate import steady_state as steady_state
+from .time.pde import AbstractEvolution as AbstractEvolution
+from .time.pde import AdvectionDiffusionReaction as AdvectionDiffusionReaction
+from .time.pde import BiharmonicDiffusion as BiharmonicDiffusion
+from .time.pde import CahnHilliard as CahnHilliard
+from .time.pde import WaveEquation as WaveEquation
+from .time.stabilize import hyperviscosity as hyperviscosity
+from .time.stabilize import upwinding as upwinding
 
 __version__ = "0.1.0"

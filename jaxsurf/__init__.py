@@ -60,6 +60,7 @@ from .shapes.order import sort_cloud as sort_cloud
 from .shapes.sampling import jitter as jitter
 from .shapes.sampling import poisson_disk as poisson_disk
 from .solve.krylov import BiCGStab as BiCGStab
+from .solve.newton import solve_nonlinear as solve_nonlinear
 from .solve.precondition import AbstractPreconditioner as AbstractPreconditioner
 from .solve.precondition import Jacobi as Jacobi
 from .solve.precondition import Multigrid as Multigrid

@@ -60,6 +60,14 @@ from .shapes.meshes import sample_mesh as sample_mesh
 from .shapes.order import sort_cloud as sort_cloud
 from .shapes.sampling import jitter as jitter
 from .shapes.sampling import poisson_disk as poisson_disk
+from .solve.krylov import BiCGStab as BiCGStab
+from .solve.newton import solve_nonlinear as solve_nonlinear
+from .solve.precondition import AbstractPreconditioner as AbstractPreconditioner
+from .solve.precondition import Jacobi as Jacobi
+from .solve.precondition import Multigrid as Multigrid
+from .solve.precondition import jacobi as jacobi
+from .solve.precondition import multigrid as multigrid
+from .solve.steady import solve as solve
 from .spectrum import Spectrum as Spectrum
 from .spectrum import spectral_estimate as spectral_estimate
 from .stencils.dcpse import DCPSE as DCPSE

@@ -1,4 +1,4 @@
-"""Poisson, screened Poisson, Helmholtz: known solutions, the mean-zero sense, gradients, failures."""
+"""Steady linear problems: known solutions, the mean-zero sense, gradients, failures."""
 
 import equinox as eqx
 import jax

@@ -12,6 +12,7 @@ import scipy.sparse
 from jaxtyping import Array, Float
 
 from ..boundary import Closure
+from ..cloud import is_concrete
 from ..stencils.stencil import AbstractOperator, Composition, Stencil
 from .padded import Layout, PaddedMatrix, incoming_layout
 from .reduced import annihilates_constants, check_scalar, reduced_matrix
@@ -175,7 +176,8 @@ def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> 
     diagonal = jnp.sum(jnp.where(own, operator.weights, 0), axis=0)
     if conditions is not None:
         diagonal = jnp.where(conditions.bound, 1, diagonal)
-    return Jacobi(None, None, jax.lax.stop_gradient(diagonal))
+    incoming = incoming_layout(operator) if is_concrete(operator.indices) else None
+    return Jacobi(incoming, None, jax.lax.stop_gradient(diagonal))
 
 
 def multigrid(

@@ -9,6 +9,7 @@ from jaxsurf.io import read
 
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data"
 _BUNNY = FOLDER / "stanford-bunny.obj"
+_ARMADILLO = FOLDER / "armadillo.obj"
 
 
 def bunny(n: int | None = None) -> js.PointCloud:
@@ -17,6 +18,19 @@ def bunny(n: int | None = None) -> js.PointCloud:
     Raises:
         FileNotFoundError: the mesh is absent.
     """
-    if not _BUNNY.exists():
-        raise FileNotFoundError(f"{_BUNNY} is absent: put the Stanford bunny there")
-    return read(_BUNNY, n=n)
+    return _scan(_BUNNY, n)
+
+
+def armadillo(n: int | None = None) -> js.PointCloud:
+    """The vertices of the Armadillo, or n quasi-uniform points on it.
+
+    Raises:
+        FileNotFoundError: the mesh is absent.
+    """
+    return _scan(_ARMADILLO, n)
+
+
+def _scan(path: Path, n: int | None) -> js.PointCloud:
+    if not path.exists():
+        raise FileNotFoundError(f"{path} is absent: put the mesh of the Stanford repository there")
+    return read(path, n=n)

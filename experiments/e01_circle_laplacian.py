@@ -16,19 +16,23 @@ from .report import Row, slope
 TITLE = "Laplace-Beltrami of sin + cos on the unit circle, order 2 (paper 001, Fig. 2c)"
 
 
+def paper_laplacian(n: int) -> tuple[js.PointCloud, js.Stencil]:
+    """Equispaced points, and the Laplacian with the paper's parameters."""
+    layer_spacing = 3 / (n - 1)
+    cloud = js.circle(n)
+    # 4.1 of these spacings are 1.96 times the distance between points: two neighbours.
+    # Three points carry the second derivative of an even stencil, although not every
+    # polynomial of the basis, hence throw=False.
+    neighbors = js.find_neighbors(cloud, radius=4.1 * layer_spacing)
+    method = js.DCPSE(order=2, layers=4, layer_spacing=layer_spacing)
+    return cloud, js.laplace_beltrami(cloud, neighbors, method=method, throw=False)
+
+
 def run(quick: bool, out: Path) -> list[Row]:
     sizes = [50, 100, 200, 400] if quick else [50, 100, 200, 400, 800, 1600]
     spacings, largest, mean = [], [], []
     for n in tqdm(sizes, desc="E1"):
-        layer_spacing = 3 / (n - 1)
-        cloud = js.circle(n)
-        # 4.1 of these spacings are 1.96 times the distance between points: two neighbours.
-        # Three points carry the second derivative of an even stencil, although not every
-        # polynomial of the basis, hence throw=False.
-        support = 4.1 * layer_spacing
-        neighbors = js.find_neighbors(cloud, radius=support)
-        method = js.DCPSE(order=2, layers=4, layer_spacing=layer_spacing)
-        laplacian = js.laplace_beltrami(cloud, neighbors, method=method, throw=False)
+        cloud, laplacian = paper_laplacian(n)
         f = jnp.sum(cloud.points, axis=1)
         error = np.abs(np.asarray(laplacian(f) + f))
         spacings.append(2 * np.pi / n)

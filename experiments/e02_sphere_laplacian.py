@@ -46,7 +46,16 @@ def harmonic(z):
 def laplacian_error(
     n: int, order: int, *, proportional: bool = False
 ) -> tuple[js.PointCloud, np.ndarray]:
-    """Points, and the error of the Laplacian of Y40 with the paper's parameters.
+    """Points, and the error of the Laplacian of Y40 with the paper's parameters."""
+    cloud, laplacian = paper_laplacian(n, order, proportional=proportional)
+    f = harmonic(cloud.points[:, 2])
+    return cloud, np.asarray(laplacian(f) + 20 * f)
+
+
+def paper_laplacian(
+    n: int, order: int, *, proportional: bool = False
+) -> tuple[js.PointCloud, js.Stencil]:
+    """Points, and the Laplacian with the paper's parameters.
 
     With `proportional` all lengths have the ratio to h that they have at N = 16,000.
     """
@@ -59,9 +68,7 @@ def laplacian_error(
     width = h if order == 2 else 0.9 * layer_spacing
     neighbors = js.find_neighbors(cloud, radius=support)
     method = js.DCPSE(order=order, layers=2, layer_spacing=layer_spacing, width=width / support)
-    laplacian = js.laplace_beltrami(cloud, neighbors, method=method)
-    f = harmonic(cloud.points[:, 2])
-    return cloud, np.asarray(laplacian(f) + 20 * f)
+    return cloud, js.laplace_beltrami(cloud, neighbors, method=method)
 
 
 def _spacing(n: int) -> float:

@@ -67,23 +67,31 @@ class Surface:
         points, normals = self.project(points)
         return js.sort_cloud(js.PointCloud(jnp.asarray(points), jnp.asarray(normals)))[0]
 
-    def field(self, x: Float[Array, " 3"]) -> Float[Array, ""]:
-        """exp((x + 2 y + 1.5 z) / size): no symmetry that could flatter a method."""
-        return jnp.exp(jnp.dot(jnp.array([1.0, 2.0, 1.5]), x) / self.size)
-
     def exact(self, cloud: js.PointCloud) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        r"""The field, $\Delta_S u = \Delta u - 2 H\,\partial_n u - n^T (\nabla\nabla u)\,n$."""
-        x = cloud.points
-        n = js.level_set_normals(self.phi, x)
-        mean = js.level_set_curvature(self.phi, x)[0]
-        gradient = jax.vmap(jax.grad(self.field))(x)
-        hessian = jax.vmap(jax.hessian(self.field))(x)
-        laplacian = (
-            jnp.trace(hessian, axis1=1, axis2=2)
-            - 2 * mean * jnp.sum(gradient * n, axis=1)
-            - jnp.einsum("na,nab,nb->n", n, hessian, n)
-        )
-        return jax.vmap(self.field)(x), laplacian
+        """The test field on the surface and its Laplacian."""
+        return exact(self.phi, self.size, cloud)
+
+
+def exact(phi, size: float, cloud: js.PointCloud) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    r"""exp((x + 2 y + 1.5 z) / size), without a symmetry that could flatter a method.
+
+    $\Delta_S u = \Delta u - 2 H\,\partial_n u - n^T (\nabla\nabla u)\,n$ on {phi = 0}.
+    """
+
+    def field(x):
+        return jnp.exp(jnp.dot(jnp.array([1.0, 2.0, 1.5]), x) / size)
+
+    x = cloud.points
+    n = js.level_set_normals(phi, x)
+    mean = js.level_set_curvature(phi, x)[0]
+    gradient = jax.vmap(jax.grad(field))(x)
+    hessian = jax.vmap(jax.hessian(field))(x)
+    laplacian = (
+        jnp.trace(hessian, axis1=1, axis2=2)
+        - 2 * mean * jnp.sum(gradient * n, axis=1)
+        - jnp.einsum("na,nab,nb->n", n, hessian, n)
+    )
+    return jax.vmap(field)(x), laplacian
 
 
 def _sphere_from_square(square: np.ndarray) -> np.ndarray:

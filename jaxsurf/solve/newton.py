@@ -18,6 +18,7 @@ from ..boundary import Closure
 from ..cloud import is_concrete
 from ..stencils.stencil import AbstractOperator, Stencil
 from .krylov import BiCGStab
+from .padded import matching_layout
 from .precondition import AbstractPreconditioner, multigrid
 from .reduced import check_scalar
 from .system import Inverse, System
@@ -109,9 +110,10 @@ def solve_nonlinear(
             "singular at u0: the operator annihilates the constants and the reaction has slope "
             "zero. Start elsewhere, or solve a linear problem with js.solve"
         )
+    layout = matching_layout(preconditioner.incoming, operator)
     concrete = is_concrete(*jax.tree.leaves((problem, u0, preconditioner)))
     limits = (rtol, atol, max_steps, throw and not concrete)
-    solution = _solve(problem, u0, preconditioner, solver, *limits)
+    solution = _solve(problem, u0, layout, preconditioner, solver, *limits)
     if throw and concrete and bool(solution.result != optx.RESULTS.successful):
         raise RuntimeError(
             f"not solved: relative residual {float(solution.stats['relative_residual']):.1e} after "
@@ -143,11 +145,11 @@ class _Problem(eqx.Module):
         u = self.field(v)
         return jax.jvp(lambda u: self.reaction(u, self.args), (u,), (jnp.ones_like(u),))[1]
 
-    def correction(self, v, residual, preconditioner, solver):
+    def correction(self, v, residual, layout, preconditioner, solver):
         """The solution of (L + r') delta = residual; what it is linearised at is a constant."""
         fixed, v = _constant((self, v))
         operator, conditions = _shifted(fixed.operator, fixed.slope(v)), fixed.conditions
-        system = System.of(operator, conditions, preconditioner.incoming, v.dtype, False)
+        system = System.of(operator, conditions, layout, v.dtype, False)
         options = {"preconditioner": _constant(Inverse(preconditioner, system))}
         return lx.linear_solve(system, residual, solver, options=options, throw=False)
 
@@ -162,7 +164,7 @@ class _State(eqx.Module):
 
 
 @eqx.filter_jit
-def _solve(problem, u0, preconditioner, solver, rtol, atol, max_steps, throw):
+def _solve(problem, u0, layout, preconditioner, solver, rtol, atol, max_steps, throw):
     fixed = _constant(problem)
     loose = BiCGStab(_FORCING, 0.0, 1000) if solver is None else solver
     tight = BiCGStab(min(rtol, 1e-8), 0.0, 1000) if solver is None else solver
@@ -173,7 +175,7 @@ def _solve(problem, u0, preconditioner, solver, rtol, atol, max_steps, throw):
     target = jnp.maximum(rtol * scale, atol)
 
     def step(state):
-        found = fixed.correction(state.v, state.residual, preconditioner, loose)
+        found = fixed.correction(state.v, state.residual, layout, preconditioner, loose)
 
         def trial(t):
             v = state.v + t * found.value
@@ -208,7 +210,8 @@ def _solve(problem, u0, preconditioner, solver, rtol, atol, max_steps, throw):
     )
     result = optx.RESULTS.where(state.size <= target, optx.RESULTS.successful, result)
     # One more Newton step has the derivative of the solution; its value is below the tolerance.
-    last = problem.correction(state.v, problem.residual(state.v), preconditioner, tight).value
+    left = problem.residual(state.v)
+    last = problem.correction(state.v, left, layout, preconditioner, tight).value
     u = problem.field(state.v + last - jax.lax.stop_gradient(last))
     if throw:
         u = eqx.error_if(

@@ -12,6 +12,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float, Int
 
+from ..cloud import is_concrete
 from ..stencils.stencil import AbstractOperator, Composition, Stencil
 
 # An entry added by a scatter costs about as much as this many padded slots.
@@ -137,6 +138,11 @@ class Incoming(eqx.Module):
         table = tabulate(turned.indptr, turned.indices, turned.data)
         return cls(stencil.indices, Table(*(jnp.asarray(a) for a in table)))
 
+    def belongs_to(self, stencil: Stencil) -> bool:
+        """Whether it was made for these indices; concrete."""
+        mine, others = self.indices, stencil.indices
+        return mine is others or np.array_equal(np.asarray(mine), np.asarray(others))
+
     def transpose(self, stencil: Stencil) -> PaddedMatrix:
         """The transposed stencil, with its weights gathered once.
 
@@ -169,6 +175,18 @@ def incoming_layout(operator: AbstractOperator) -> Layout:
     if isinstance(operator, Composition):
         return incoming_layout(operator.outer), incoming_layout(operator.inner)
     return Incoming.of(operator) if isinstance(operator, Stencil) else None
+
+
+def matching_layout(layout: Layout, operator: AbstractOperator) -> Layout:
+    """The layout if it is one of this operator, as far as can be seen; else a new one."""
+    if isinstance(operator, Composition) and isinstance(layout, tuple):
+        return matching_layout(layout[0], operator.outer), matching_layout(
+            layout[1], operator.inner
+        )
+    if isinstance(operator, Stencil) and is_concrete(operator.indices):
+        if not isinstance(layout, Incoming) or not layout.belongs_to(operator):
+            return Incoming.of(operator)
+    return layout
 
 
 def adjoint(operator: AbstractOperator, layout: Layout) -> Callable | None:

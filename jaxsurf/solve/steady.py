@@ -13,6 +13,7 @@ from ..boundary import Closure
 from ..cloud import is_concrete
 from ..stencils.stencil import AbstractOperator
 from .krylov import BiCGStab
+from .padded import matching_layout
 from .precondition import AbstractPreconditioner, multigrid
 from .reduced import annihilates_constants, check_scalar, reduced_matrix
 from .system import Inverse, System
@@ -88,7 +89,8 @@ def solve(
     if solver is None:
         solver = BiCGStab(rtol, atol, max_steps)
     concrete = is_concrete(*jax.tree.leaves((operator, rhs, conditions, preconditioner)))
-    problem = (operator, conditions, preconditioner, solver, mean_zero, rtol, atol)
+    layout = matching_layout(preconditioner.incoming, operator)
+    problem = (operator, layout, conditions, preconditioner, solver, mean_zero, rtol, atol)
     one = lambda f: _solve(f, *problem, throw and not concrete)
     if rhs.ndim == 1:
         solution = one(rhs)
@@ -100,8 +102,8 @@ def solve(
 
 
 @eqx.filter_jit
-def _solve(rhs, operator, conditions, preconditioner, solver, mean_zero, rtol, atol, throw):
-    system = System.of(operator, conditions, preconditioner.incoming, rhs.dtype, mean_zero)
+def _solve(rhs, operator, layout, conditions, preconditioner, solver, mean_zero, rtol, atol, throw):
+    system = System.of(operator, conditions, layout, rhs.dtype, mean_zero)
     offset = jnp.zeros_like(rhs) if conditions is None else conditions.offset()
     known = rhs if conditions is None else system.free(rhs - operator(offset))
     inverse = Inverse(preconditioner, system)

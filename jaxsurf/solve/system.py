@@ -105,7 +105,7 @@ class Transposed(_Square):
         else:
             v = self.adjoint(v)
         if system.conditions is not None:
-            (v,) = jax.linear_transpose(system.conditions.homogeneous, shape)(v)
+            v = _turned(system.conditions, v)
         return v + system.rest(vector)
 
     def transpose(self):
@@ -134,6 +134,12 @@ class Inverse(_Square):
 
     def in_structure(self):
         return self.system.in_structure()
+
+
+def _turned(conditions, v):
+    """Eᵀ v: what a bound value came from gets its share; only free points are left."""
+    shares = conditions.weights * v[conditions.rows]
+    return conditions.restrict(v.at[conditions.indices].add(shares))
 
 
 for _kind in (System, Transposed, Inverse):

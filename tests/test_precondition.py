@@ -1,0 +1,159 @@
+"""The multigrid cycle as a linear map: its transpose, its factor, what it refuses."""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsurf as js
+from jaxsurf.solve.padded import PaddedMatrix, adjoint, incoming_layout
+from jaxsurf.solve.reduced import annihilates_constants, reduced_matrix
+
+from .helpers import random_sphere
+
+
+def _fields(n, count=2, seed=0):
+    return [jnp.asarray(v) for v in np.random.default_rng(seed).normal(size=(count, n))]
+
+
+@pytest.fixture(scope="module")
+def screened():
+    # Random points: neighbourhoods of very different sizes, unsymmetric.
+    return js.laplace_beltrami(random_sphere(1_500)).scaled(-1.0).shifted(1.0)
+
+
+def test_padded_matrix_with_uneven_rows():
+    rng = np.random.default_rng(0)
+    dense = rng.normal(size=(60, 40)) * (rng.random((60, 40)) < 0.1)
+    dense[7] = rng.normal(size=40)  # one long row goes to the list
+    dense[8] = 0
+    import scipy.sparse
+
+    matrix = PaddedMatrix.from_scipy(scipy.sparse.csr_matrix(dense), np.float64)
+    assert matrix.indices.shape[0] < 40 and matrix.extra[0].size > 0
+    x = rng.normal(size=40)
+    np.testing.assert_allclose(matrix(jnp.asarray(x)), dense @ x, atol=1e-13)
+
+
+def test_adjoint_by_gathers_is_the_transpose(screened):
+    u, v = _fields(screened.n)
+    turned = adjoint(screened, incoming_layout(screened))
+    np.testing.assert_allclose(jnp.vdot(v, screened(u)), jnp.vdot(turned(v), u), rtol=1e-12)
+    twice = screened @ screened
+    turned = adjoint(twice, incoming_layout(twice))
+    np.testing.assert_allclose(jnp.vdot(v, twice(u)), jnp.vdot(turned(v), u), rtol=1e-12)
+    # No scatter of the size of the stencil: only what stuck out of the slots.
+    jaxpr = str(jax.make_jaxpr(lambda v: adjoint(screened, incoming_layout(screened))(v))(v))
+    assert jaxpr.count("= scatter") <= 1
+
+
+def test_cycle_is_linear_and_its_transpose_exact(screened):
+    u, v = _fields(screened.n)
+    cycle = js.multigrid(screened, single=False)
+    assert len(cycle.levels) >= 1
+    np.testing.assert_allclose(cycle(2 * u + v), 2 * cycle(u) + cycle(v), atol=1e-12)
+    np.testing.assert_allclose(jnp.vdot(v, cycle(u)), jnp.vdot(cycle.transpose()(v), u), rtol=1e-12)
+    single = js.multigrid(screened)
+    assert single.coarsest.dtype == np.float32
+    np.testing.assert_allclose(single(u), cycle(u), atol=1e-5 * float(jnp.abs(cycle(u)).max()))
+    # The scale of a residual does not matter in single precision either.
+    np.testing.assert_allclose(single(1e-60 * u) * 1e60, single(u), rtol=1e-5, atol=1e-9)
+
+
+def test_one_cycle_damps_every_error():
+    # Spectral radius of I - M A, by the power method.
+    screened = js.laplace_beltrami(js.sphere(3_000)).scaled(-1.0).shifted(1.0)
+    cycle = js.multigrid(screened, single=False)
+    step = jax.jit(lambda e: e - cycle(screened(e)))
+    (e,) = _fields(screened.n, 1)
+    for _ in range(30):
+        e, last = step(e), jnp.linalg.norm(e)
+        ratio = float(jnp.linalg.norm(e) / last)
+        e = e / jnp.linalg.norm(e)
+    assert ratio < 0.4
+
+
+@pytest.mark.parametrize("transform", ["jit", "vmap"])
+def test_cycle_under_transformations(screened, transform):
+    cycle = js.multigrid(screened)
+    u, v = _fields(screened.n)
+    if transform == "jit":
+        together = jnp.stack([jax.jit(lambda m, u: m(u))(cycle, u), cycle(v)])
+    else:
+        together = jax.vmap(cycle)(jnp.stack([u, v]))
+    np.testing.assert_allclose(together, jnp.stack([cycle(u), cycle(v)]), rtol=1e-4, atol=1e-7)
+
+
+def test_no_square_array_in_the_cycle(screened):
+    cycle = js.multigrid(screened)
+    (u,) = _fields(screened.n, 1)
+    n = screened.n
+    text = str(jax.make_jaxpr(lambda m, u: (m(u), m.transpose()(u)))(cycle, u))
+    assert f"{n},{n}" not in text
+
+
+def test_jacobi_is_the_diagonal():
+    cloud = js.sphere(300)
+    operator = js.laplace_beltrami(cloud).shifted(-3.0)
+    diagonal = operator.to_scipy().diagonal()
+    np.testing.assert_allclose(js.jacobi(operator).diagonal, diagonal, rtol=1e-12)
+    bound = jnp.arange(300) < 10
+    conditions = js.close(cloud, js.dirichlet(bound, 0.0))
+    with_conditions = js.jacobi(operator, conditions=conditions).diagonal
+    np.testing.assert_allclose(with_conditions, jnp.where(bound, 1, diagonal), rtol=1e-12)
+    with pytest.raises(ValueError, match="Composition"):
+        js.jacobi(operator @ operator)
+
+
+def test_constants_are_recognised():
+    cloud = js.sphere(400)
+    laplacian = js.laplace_beltrami(cloud)
+    pinned = js.close(cloud, js.dirichlet(np.array([3]), 1.0))
+
+    def singular(operator, conditions=None):
+        return annihilates_constants(reduced_matrix(operator, conditions), conditions)
+
+    assert singular(laplacian) and singular(laplacian.scaled(-2.0))
+    assert singular(laplacian @ laplacian)
+    assert not singular(laplacian.shifted(-1e-6))
+    assert not singular(laplacian, pinned)
+
+
+def test_separate_parts_are_singular_and_named():
+    one = js.sphere(300)
+    apart = jnp.concatenate([one.points, one.points + 10])
+    two = js.PointCloud(apart, jnp.concatenate([one.normals] * 2))
+    laplacian = js.laplace_beltrami(two)
+    with pytest.raises(ValueError, match=r"2 parts .* 300 points around point 0"):
+        js.multigrid(laplacian)
+    # A value on one of them leaves the other.
+    pinned = js.close(two, js.dirichlet(np.array([0]), 0.0))
+    with pytest.raises(ValueError, match=r"300 points around point 300"):
+        js.multigrid(laplacian, conditions=pinned)
+
+
+def test_bad_operators_are_refused():
+    cloud = js.sphere(300)
+    laplacian = js.laplace_beltrami(cloud)
+    with pytest.raises(ValueError, match=r"from \(\) to \(3,\) components"):
+        js.multigrid(js.surface_gradient(cloud))
+    broken = js.Stencil(laplacian.indices, laplacian.weights.at[2, 17].set(jnp.nan))
+    with pytest.raises(ValueError, match="not finite, first at point 17"):
+        js.multigrid(broken)
+    empty = js.Stencil(laplacian.indices, laplacian.weights.at[:, 5].set(0.0))
+    with pytest.raises(ValueError, match="row 5 of the operator is zero"):
+        js.multigrid(empty)
+    with pytest.raises(ValueError, match="outside jit"):
+        jax.jit(lambda w: js.multigrid(js.Stencil(laplacian.indices, w)).coarsest)(
+            laplacian.weights
+        )
+
+
+def test_without_pyamg_the_extra_and_the_alternative_are_named(monkeypatch):
+    operator = js.laplace_beltrami(js.sphere(1_000)).shifted(-1.0)
+    for name in ("pyamg", "pyamg.aggregation", "pyamg.strength"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ImportError, match=r"jaxsurf\[multigrid\].*js\.jacobi"):
+        js.multigrid(operator)

@@ -1,0 +1,332 @@
+"""Steady linear problems: known solutions, the mean-zero sense, gradients, failures."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+
+import jaxsurf as js
+from jaxsurf.solve.system import Inverse, System
+
+from .helpers import check_derivative, exponential, relative_error
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    cloud = js.sphere(1_500)
+    laplacian = js.laplace_beltrami(cloud)
+    return cloud, laplacian, js.multigrid(laplacian)
+
+
+def _mean_free(u):
+    return u - jnp.mean(u)
+
+
+@pytest.mark.parametrize(
+    "method, order, bound",
+    [(js.DCPSE(order=2), 2, 1e-3), (js.DCPSE(order=4), 4, 5e-6), (js.GFDM(degree=3), 2, 1.3e-3)],
+)
+def test_poisson_on_the_closed_sphere_converges(method, order, bound):
+    sizes, errors = [2_000, 8_000], []
+    for n in sizes:
+        cloud = js.sphere(n)
+        u, _, f = exponential(cloud.points)
+        found = js.solve(js.laplace_beltrami(cloud, method=method), f, rtol=1e-10)
+        errors.append(relative_error(_mean_free(found.value), _mean_free(u)))
+    assert errors[1] < bound
+    assert np.log(errors[0] / errors[1]) / np.log(2) > order - 0.2
+
+
+def test_screened_anisotropic_and_helmholtz(sphere):
+    cloud, laplacian, _ = sphere
+    u, gradient, lu = exponential(cloud.points)
+    found = js.solve(laplacian.scaled(-1.0).shifted(2.0), 2 * u - lu)
+    assert relative_error(found.value, u) < 1e-2
+    # div(D grad u) with D = 1 + z/2: grad D is the tangential part of (0, 0, 1/2).
+    z = cloud.points[:, 2]
+    f = (1 + z / 2) * lu + gradient[:, 2] / 2
+    found = js.solve(js.diffusion(cloud, 1 + z / 2), f)
+    assert relative_error(_mean_free(found.value), _mean_free(u)) < 2e-2
+    # Indefinite: κ² = 4 lies between the eigenvalues 2 and 6.
+    precondition = js.multigrid(laplacian.shifted(-4.0))
+    found = js.solve(laplacian.shifted(4.0), lu + 4 * u, preconditioner=precondition)
+    assert relative_error(found.value, u) < 2e-2
+    assert float(found.stats["relative_residual"]) < 1.5e-8
+
+
+def test_biharmonic(sphere):
+    cloud, laplacian, _ = sphere
+    z = cloud.points[:, 2]
+    found = js.solve(laplacian @ laplacian, 4 * z)
+    assert relative_error(found.value, z) < 5e-3
+
+
+def test_mean_zero_sense(sphere):
+    cloud, laplacian, preconditioner = sphere
+    z = cloud.points[:, 2]
+    found = js.solve(laplacian, -2 * z + 3.0, preconditioner=preconditioner)
+    # The incompatible part is reported, and the rest is solved for.
+    assert abs(float(found.stats["incompatible"]) - 3) < 1e-8
+    assert abs(float(jnp.mean(found.value))) < 1e-14
+    left = laplacian(found.value) - (-2 * z + 3.0) + found.stats["incompatible"]
+    assert float(jnp.linalg.norm(left)) < 1.5e-8 * float(jnp.linalg.norm(-2 * z + 3.0))
+    # The sign of the operator does not matter, nor does the preconditioner.
+    other = js.solve(
+        laplacian.scaled(-1.0), 2 * z - 3.0, preconditioner=js.jacobi(laplacian.scaled(-1.0))
+    )
+    np.testing.assert_allclose(other.value, found.value, atol=1e-6)
+    assert abs(float(other.stats["incompatible"]) + 3) < 1e-6
+
+
+def test_conditions_are_met_and_equations_hold_elsewhere(sphere):
+    cloud, laplacian, _ = sphere
+    z = cloud.points[:, 2]
+    band = np.flatnonzero(np.abs(z) < 0.05)
+    conditions = js.close(cloud, js.dirichlet(band, z[band] + 1.0))
+    found = js.solve(laplacian, -2 * z, conditions=conditions)
+    assert float(jnp.abs(found.value - z - 1)[band].max()) < 1e-14
+    assert float(jnp.abs(found.value - z - 1).max()) < 2e-3
+    free = ~np.asarray(conditions.bound)
+    left = (laplacian(found.value) + 2 * z)[free]
+    assert float(jnp.linalg.norm(left)) < 1e-7 * float(jnp.linalg.norm(z))
+    # Values of the right-hand side at bound points do not count.
+    again = js.solve(laplacian, (-2 * z).at[band].set(1e3), conditions=conditions)
+    np.testing.assert_allclose(again.value, found.value, atol=1e-9)
+
+
+def test_several_right_hand_sides_and_transformations(sphere):
+    cloud, laplacian, preconditioner = sphere
+    f = jnp.stack([cloud.points[:, 2], cloud.points[:, 0] * cloud.points[:, 1]], axis=1)
+    together = js.solve(laplacian, f, preconditioner=preconditioner)
+    assert together.value.shape == f.shape and together.stats["num_steps"].shape == (2,)
+    solve = lambda f: js.solve(laplacian, f, preconditioner=preconditioner).value
+    one = solve(f[:, 1])
+    np.testing.assert_allclose(together.value[:, 1], one, atol=1e-8)
+    np.testing.assert_allclose(jax.jit(solve)(f[:, 1]), one, atol=1e-12)
+    np.testing.assert_allclose(jax.vmap(solve, 1, 1)(f), together.value, atol=1e-12)
+
+
+def test_no_retracing_for_other_values(sphere):
+    cloud, laplacian, preconditioner = sphere
+    traces = 0
+
+    @jax.jit
+    def solve(weights, f):
+        nonlocal traces
+        traces += 1
+        operator = eqx.tree_at(lambda o: o.weights, laplacian, weights)
+        return js.solve(operator, f, preconditioner=preconditioner).value
+
+    solve(laplacian.weights, cloud.points[:, 0])
+    solve(2 * laplacian.weights, cloud.points[:, 1])
+    assert traces == 1
+
+
+def test_derivatives_in_weights_and_right_hand_side(sphere):
+    cloud, laplacian, preconditioner = sphere
+    z = cloud.points[:, 2]
+    _, _, f = exponential(cloud.points)
+    weight = jnp.sin(3 * z)
+
+    def total(weights, f):
+        operator = eqx.tree_at(lambda o: o.weights, laplacian, weights)
+        found = js.solve(operator, f, preconditioner=preconditioner, rtol=1e-13)
+        return jnp.sum(weight * found.value**2)
+
+    check_derivative(lambda f: total(laplacian.weights, f), f, step=1e-3)
+    # Row sums stay zero along w -> w s_i, as they do for a moving geometry.
+    scale = 1 + 0.3 * z
+    check_derivative(lambda s: total(laplacian.weights * s, f), scale, step=1e-3)
+
+
+def test_derivative_in_the_geometry():
+    cloud = js.sphere(800)
+    neighbors = js.find_neighbors(cloud, k=24)
+    normals = cloud.normals
+    laplacian = js.laplace_beltrami(cloud, neighbors)
+    preconditioner = js.multigrid(laplacian)
+
+    def total(points):
+        moved = js.PointCloud(points, normals)
+        operator = js.laplace_beltrami(moved, neighbors)
+        f = points[:, 0] * points[:, 1] + points[:, 2]
+        found = js.solve(operator, f, preconditioner=preconditioner, rtol=1e-12)
+        return jnp.sum(found.value**2)
+
+    check_derivative(total, cloud.points, step=1e-4)
+
+
+def test_derivatives_with_conditions_and_jacobi(sphere):
+    cloud, laplacian, _ = sphere
+    z = cloud.points[:, 2]
+    cap = np.flatnonzero(z > 0.7)
+    operator = laplacian.scaled(-1.0).shifted(1.0)
+
+    def total(values, f, weights):
+        conditions = js.close(cloud, js.dirichlet(cap, values))
+        moved = eqx.tree_at(lambda o: o.weights, operator, weights)
+        found = js.solve(
+            moved, f, conditions=conditions, mean_zero=False, rtol=1e-13,
+            preconditioner=js.jacobi(moved, conditions=conditions),
+        )  # fmt: skip
+        return jnp.sum(found.value**3)
+
+    values, f, weights = z[cap] + 1, 3 * z, operator.weights
+    check_derivative(lambda g: total(g, f, weights), values, step=1e-2)
+    check_derivative(lambda f: total(values, f, weights), f, step=1e-2)
+    check_derivative(lambda w: total(values, f, w), weights, step=1e-2)
+
+
+def test_the_transposed_system_with_flux_conditions():
+    # A patch of the sphere with no-flux borders: bound values depend on free ones.
+    cloud = js.sphere(1_200)
+    keep = np.flatnonzero(cloud.points[:, 2] > 0.2)
+    points = cloud.points[keep]
+    border = points[:, 2] < 0.28
+    patch = js.PointCloud(points, points)
+    down = jnp.array([0.0, 0.0, -1.0])
+    conormals = down - points[border] * (points[border] @ down)[:, None]
+    conormals = conormals / jnp.linalg.norm(conormals, axis=1, keepdims=True)
+    conditions = js.close(patch, js.neumann(border, 0.0, conormals=conormals))
+    laplacian = js.laplace_beltrami(patch, throw=False)
+    preconditioner = js.multigrid(laplacian, conditions=conditions)
+    assert preconditioner.mean_zero
+    system = System.of(laplacian, conditions, preconditioner.incoming, jnp.float64, True)
+    u, v = jnp.asarray(np.random.default_rng(0).normal(size=(2, patch.n)))
+    one, other = jnp.vdot(v, system.mv(u)), jnp.vdot(system.transpose().mv(v), u)
+    np.testing.assert_allclose(one, other, rtol=1e-11)
+    inverse = Inverse(js.multigrid(laplacian, conditions=conditions, single=False), system)
+    one, other = jnp.vdot(v, inverse.mv(u)), jnp.vdot(inverse.transpose().mv(v), u)
+    np.testing.assert_allclose(one, other, rtol=1e-11)
+
+    found = js.solve(laplacian, points[:, 0], conditions=conditions, preconditioner=preconditioner)
+    assert abs(float(jnp.mean(found.value))) < 1e-13
+    total = lambda f: jnp.sum(
+        js.solve(
+            laplacian, f, conditions=conditions, preconditioner=preconditioner, rtol=1e-12
+        ).value
+        ** 2
+    )
+    check_derivative(total, points[:, 0] + points[:, 1] ** 2, step=1e-2)
+
+
+def test_no_square_array(sphere):
+    cloud, laplacian, preconditioner = sphere
+    n = cloud.n
+
+    def total(weights, f):
+        operator = eqx.tree_at(lambda o: o.weights, laplacian, weights)
+        return jnp.sum(js.solve(operator, f, preconditioner=preconditioner).value ** 2)
+
+    jaxpr = jax.make_jaxpr(jax.grad(total, argnums=(0, 1)))(laplacian.weights, cloud.points[:, 0])
+    assert f"{n},{n}" not in str(jaxpr)
+
+
+@pytest.mark.parametrize("n", [1_500, 12_000])
+def test_steps_hardly_grow(n):
+    cloud = js.sphere(n)
+    neighbors = js.find_neighbors(cloud, k=20, throw=False)
+    laplacian = js.laplace_beltrami(cloud, neighbors, method=js.GFDM(degree=2))
+    found = js.solve(laplacian, exponential(cloud.points)[2])
+    assert int(found.stats["num_steps"]) <= 8
+    assert float(found.stats["relative_residual"]) < 1.5e-8
+
+
+def test_a_solver_of_lineax(sphere):
+    cloud, laplacian, preconditioner = sphere
+    z = cloud.points[:, 2]
+    gmres = lx.GMRES(rtol=1e-10, atol=1e-10, norm=lx.internal.two_norm)
+    found = js.solve(laplacian, -2 * z, preconditioner=preconditioner, solver=gmres)
+    assert relative_error(found.value, z) < 2e-3
+    # It says that it is done; the residual says otherwise.
+    loose = lx.BiCGStab(rtol=1e-1, atol=1e-1)
+    with pytest.raises(RuntimeError, match="relative residual"):
+        js.solve(laplacian, -2 * z, preconditioner=preconditioner, solver=loose)
+
+
+def test_failures_speak(sphere):
+    cloud, laplacian, preconditioner = sphere
+    z = cloud.points[:, 2]
+    with pytest.raises(RuntimeError, match=r"relative residual .* after 1 steps, wanted rtol"):
+        js.solve(laplacian, z, max_steps=1)
+    kept = js.solve(laplacian, z, max_steps=1, throw=False)
+    assert kept.result == lx.RESULTS.max_steps_reached
+    assert 1e-8 < float(kept.stats["relative_residual"]) < 1
+    with pytest.raises(RuntimeError, match="for right-hand side 1"):
+        js.solve(laplacian, jnp.stack([0 * z, z], axis=1), max_steps=1)
+    # A tolerance below round-off.
+    with pytest.raises(RuntimeError, match="below round-off"):
+        js.solve(laplacian, z, rtol=1e-18)
+    # Under jit the same is an error of the compiled program.
+    with pytest.raises(Exception, match=r"did not reach rtol = 1e-08"):
+        solve = eqx.filter_jit(
+            lambda f: js.solve(laplacian, f, preconditioner=preconditioner, max_steps=1).value
+        )
+        solve(z).block_until_ready()
+
+
+def test_a_singular_system_is_an_error(sphere):
+    cloud, laplacian, _ = sphere
+    # One equation twice, in place of another: no null vector that could be known beforehand.
+    weights = laplacian.weights.at[:, 1].set(0.0).at[0, 1].set(1.0).at[0, 0].add(1.0)
+    indices = laplacian.indices.at[:, 1].set(laplacian.indices[:, 0])
+    weights = weights.at[:, 1].set(weights[:, 0])
+    singular = js.Stencil(indices, weights)
+    f = cloud.points[:, 2] + 1.0
+    with pytest.raises(RuntimeError, match="may be singular"):
+        js.solve(singular, f, preconditioner=js.jacobi(laplacian), max_steps=200)
+
+
+def test_bad_input(sphere):
+    cloud, laplacian, preconditioner = sphere
+    z = cloud.points[:, 2]
+    with pytest.raises(ValueError, match="right-hand side is not finite at point 9"):
+        js.solve(laplacian, z.at[9].set(jnp.nan))
+    with pytest.raises(ValueError, match=r"shape \(3,\), expected \(1500,\) or \(1500, c\)"):
+        js.solve(laplacian, jnp.zeros(3))
+    with pytest.raises(ValueError, match=r"components"):
+        js.solve(js.surface_gradient(cloud), z)
+    with pytest.raises(ValueError, match="outside jit"):
+        jax.jit(lambda w: js.solve(js.Stencil(laplacian.indices, w), z).value)(laplacian.weights)
+    with pytest.raises(ValueError, match="mean_zero=True or False"):
+        jax.jit(
+            lambda w: (
+                js.solve(
+                    js.Stencil(laplacian.indices, w), z, preconditioner=js.jacobi(laplacian)
+                ).value
+            )
+        )(laplacian.weights)
+    solve = lambda f: js.solve(laplacian, f, preconditioner=preconditioner, throw=False)
+    assert jax.jit(lambda f: solve(f).result)(z.at[9].set(jnp.nan)) == lx.RESULTS.nonfinite_input
+
+
+def test_a_preconditioner_of_other_neighbours_does_not_spoil_the_gradient(sphere):
+    cloud, laplacian, _ = sphere
+    z = cloud.points[:, 2]
+    k = laplacian.k
+    shuffled = js.Stencil(
+        jnp.concatenate([laplacian.indices[:1], laplacian.indices[:0:-1]]),
+        jnp.concatenate([laplacian.weights[:1], laplacian.weights[:0:-1]]),
+    )
+    assert shuffled.k == k
+    preconditioner = js.multigrid(shuffled)
+    total = lambda f: jnp.sum(js.solve(laplacian, f, preconditioner=preconditioner).value ** 2)
+    exact = lambda f: jnp.sum(js.solve(laplacian, f).value ** 2)
+    f = z + z**2
+    expected = jax.grad(
+        lambda f: jnp.sum(js.solve(laplacian, f, preconditioner=js.multigrid(laplacian)).value ** 2)
+    )(f)
+    assert abs(float(total(f) - exact(f))) < 1e-6 * float(exact(f))
+    np.testing.assert_allclose(jax.grad(total)(f), expected, atol=1e-6)
+
+
+def test_single_precision():
+    cloud = js.sphere(1_000)
+    single = js.PointCloud(cloud.points.astype(jnp.float32), cloud.normals.astype(jnp.float32))
+    operator = js.laplace_beltrami(single).scaled(-1.0).shifted(1.0)
+    z = single.points[:, 2]
+    found = js.solve(operator, 3 * z, rtol=1e-4)
+    assert found.value.dtype == jnp.float32
+    assert float(jnp.abs(found.value - z).max()) < 5e-3

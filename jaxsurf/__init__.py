@@ -9,6 +9,7 @@ from .borders import detect_border as detect_border
 from .borders import find_border as find_border
 from .boundary import Closure as Closure
 from .boundary import close as close
+from .build import choose_neighbors as choose_neighbors
 from .cells import SearchCapacity as SearchCapacity
 from .cells import allocate as allocate
 from .cells import search_neighbors as search_neighbors
@@ -26,6 +27,7 @@ from .frames import estimate_normals as estimate_normals
 from .frames import from_points as from_points
 from .frames import refit_normals as refit_normals
 from .frames import tangent_frames as tangent_frames
+from .ghosts import with_ghosts as with_ghosts
 from .io import read as read
 from .io import read_fields as read_fields
 from .io import write as write
@@ -33,7 +35,6 @@ from .neighbors import Neighbors as Neighbors
 from .neighbors import find_neighbors as find_neighbors
 from .neighbors import tube_ratio as tube_ratio
 from .operators import biharmonic as biharmonic
-from .operators import choose_neighbors as choose_neighbors
 from .operators import diffusion as diffusion
 from .operators import directional_derivative as directional_derivative
 from .operators import laplace_beltrami as laplace_beltrami
@@ -59,6 +60,14 @@ from .shapes.meshes import sample_mesh as sample_mesh
 from .shapes.order import sort_cloud as sort_cloud
 from .shapes.sampling import jitter as jitter
 from .shapes.sampling import poisson_disk as poisson_disk
+from .solve.krylov import BiCGStab as BiCGStab
+from .solve.newton import solve_nonlinear as solve_nonlinear
+from .solve.precondition import AbstractPreconditioner as AbstractPreconditioner
+from .solve.precondition import Jacobi as Jacobi
+from .solve.precondition import Multigrid as Multigrid
+from .solve.precondition import jacobi as jacobi
+from .solve.precondition import multigrid as multigrid
+from .solve.steady import solve as solve
 from .spectrum import Spectrum as Spectrum
 from .spectrum import spectral_estimate as spectral_estimate
 from .stencils.dcpse import DCPSE as DCPSE

@@ -102,7 +102,7 @@ def test_damping_moves_all_eigenvalues_of_advection_to_the_left(cloud):
     assert scipy.linalg.eigvals(matrix).real.max() > 1e-3
     assert growth(js.hyperviscosity(laplacian, 1.0, power=2, strength=0.3)) < 1e-10
     assert growth(js.hyperviscosity(laplacian, 1.0, power=3)) < 1e-4
-    upwind = js.upwinding(cloud, velocity, neighbors=neighbors, method=METHOD, strength=2.0)
+    upwind = js.upwinding(cloud, velocity, neighbors=neighbors, method=METHOD)
     assert growth(upwind) < 1e-10
 
 

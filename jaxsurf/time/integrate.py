@@ -212,16 +212,18 @@ def _reason(run: Run, solution: dfx.Solution, t: float, state) -> str:
         int(solution.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected")
     )
     largest = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(state))
-    why = {
-        dfx.RESULTS.max_steps_reached: "the largest number of steps was reached",
-        dfx.RESULTS.dt_min_reached: (
-            "no step is short enough: the solution diverges or the tolerance cannot be met"
+    why = (
+        (dfx.RESULTS.max_steps_reached, "the largest number of steps was reached"),
+        (
+            dfx.RESULTS.dt_min_reached,
+            "no step is short enough: the solution diverges or the tolerance cannot be met",
         ),
-        dfx.RESULTS.nonlinear_divergence: (
-            "a step diverged, needed more stages than allowed, or its equations have no solution"
+        (
+            dfx.RESULTS.nonlinear_divergence,
+            "a step diverged, needed more stages than allowed, or its equations have no solution",
         ),
-    }
-    reason = next((text for code, text in why.items() if solution.result == code), None)
+    )
+    reason = next((text for code, text in why if solution.result == code), None)
     if reason is None:
         reason = f"a linear system was not solved ({dfx.RESULTS[solution.result]})"  # type: ignore[misc]
     return (

@@ -20,15 +20,15 @@ class Tableau(eqx.Module):
     """Coefficients of an additive Runge–Kutta method whose stages are solved one after another.
 
     Args:
-        explicit, implicit: strictly lower rows, stage by stage.
-        diagonal: of the implicit part.
+        explicit, implicit: strictly lower matrices.
+        diagonal: of the implicit part; all entries but the first, which is zero, are equal.
         nodes: times of the stages, as fractions of the step.
         weights: of the result.
         errors: weights of the result minus those of the embedded one.
     """
 
-    explicit: Sequence[np.ndarray]
-    implicit: Sequence[np.ndarray]
+    explicit: np.ndarray
+    implicit: np.ndarray
     diagonal: np.ndarray
     nodes: np.ndarray
     weights: np.ndarray
@@ -37,13 +37,20 @@ class Tableau(eqx.Module):
     @classmethod
     def of(cls, explicit: dfx.ButcherTableau, implicit: dfx.ButcherTableau) -> Tableau:
         return cls(
-            (np.zeros(0), *explicit.a_lower),
-            (np.zeros(0), *implicit.a_lower),
+            _lower(explicit.a_lower),
+            _lower(implicit.a_lower),
             np.asarray(implicit.a_diagonal),
             np.append(0.0, implicit.c),
             np.asarray(implicit.b_sol),
             np.asarray(implicit.b_error),
         )
+
+
+def _lower(rows: Sequence[np.ndarray]) -> np.ndarray:
+    matrix = np.zeros((len(rows) + 1, len(rows) + 1))
+    for i, row in enumerate(rows, 1):
+        matrix[i, :i] = row
+    return matrix
 
 
 def _ark2() -> Tableau:
@@ -54,8 +61,8 @@ def _ark2() -> Tableau:
     weights = np.array([delta, delta, gamma])
     embedded = np.array([(4 - root) / 8, (4 - root) / 8, delta])
     return Tableau(
-        (np.zeros(0), np.array([2 * gamma]), np.array([1 - last, last])),
-        (np.zeros(0), np.array([gamma]), np.array([delta, delta])),
+        _lower([np.array([2 * gamma]), np.array([1 - last, last])]),
+        _lower([np.array([gamma]), np.array([delta, delta])]),
         np.array([0, gamma, gamma]),
         np.array([0, 2 * gamma, 1]),
         weights,
@@ -140,10 +147,11 @@ class IMEX(dfx.AbstractAdaptiveSolver):
         solver = _relative(self.solver, self.tolerance, y0)
 
         def solve(t, known, start, factor):
-            def residual_free(y):
-                return _combine(y, [-factor], [implicit.vf_prod(t, y, args, span)])
+            def left_side(y):
+                change = implicit.vf_prod(t, y, args, span)
+                return jax.tree.map(lambda y, k: y - factor * k, y, change)
 
-            operator = lx.FunctionLinearOperator(residual_free, jax.eval_shape(lambda: y0))
+            operator = lx.FunctionLinearOperator(left_side, jax.eval_shape(lambda: y0))
             options = {}
             if self.preconditioner is not None:
                 options["preconditioner"] = self.preconditioner(factor * (t1 - t0))
@@ -264,37 +272,51 @@ _FORCING = 1e-2
 def _steps(tableau: Tableau, terms, solve, t0, t1, y0, args, rates):
     """All stages of one step, for one term (implicit) or two (explicit, implicit).
 
+    A loop over stages, not one after the other in the program, which compiles several times as
+    fast.
+
     Args:
         solve: (t, r, start, γ) -> y with y - γ Δt f(t, y) = r, and its result code.
         rates: the terms at the start of the step, from the step before.
     """
     span = [term.contr(t0, t1) for term in terms]
-    # Increments, stage by stage.
-    explicit: list[PyTree[Array]] = []
-    implicit: list[PyTree[Array]] = []
-    y, ok = y0, dfx.RESULTS.successful
-    for i, (gamma, node) in enumerate(zip(tableau.diagonal, tableau.nodes)):
+    matrices = (tableau.explicit, tableau.implicit)[-len(terms) :]
+    gamma = float(tableau.diagonal[1])
+    first = [term.prod(rate, s) for term, rate, s in zip(terms, rates, span)]
+    count = len(tableau.nodes)
+    # Increments, term by term and stage by stage.
+    room = jax.tree.map(lambda k: jnp.zeros((count, *k.shape), k.dtype).at[0].set(k), first)
+
+    def stage(carry, row):
+        y, room, ok = carry
+        i, node, weights = row
+        known = y0
+        for w, increments in zip(weights, room):
+            known = _combined(known, w, increments)
         t = t0 + node * (t1 - t0)
-        if i == 0:
-            increments = [term.prod(rate, s) for term, rate, s in zip(terms, rates, span)]
-        else:
-            known = _combine(y0, tableau.implicit[i], implicit)
-            if len(terms) == 2:
-                known = _combine(known, tableau.explicit[i], explicit)
-            y, result = solve(t, known, y, gamma)
-            ok = dfx.RESULTS.where(ok == dfx.RESULTS.successful, result, ok)
-            increments = [term.vf_prod(t, y, args, s) for term, s in zip(terms, span)]
-        implicit.append(increments[-1])
-        explicit.append(increments[0])
-    total = implicit if len(terms) == 1 else [_sum(pair) for pair in zip(explicit, implicit)]
-    y1 = _combine(y0, tableau.weights, total)
+        y, result = solve(t, known, y, gamma)
+        ok = dfx.RESULTS.where(ok == dfx.RESULTS.successful, result, ok)
+        new = [term.vf_prod(t, y, args, s) for term, s in zip(terms, span)]
+        room = jax.tree.map(lambda r, k: r.at[i].set(k), room, new)
+        return (y, room, ok), None
+
+    real = _dtype(y0)
+    rows = (
+        jnp.arange(1, count),
+        jnp.asarray(tableau.nodes[1:], real),
+        [jnp.asarray(matrix[1:], real) for matrix in matrices],
+    )
+    fine = dfx.RESULTS.successful
+    start = (y0, room, dfx.RESULTS.where(jnp.asarray(True), fine, fine))
+    (_, room, ok), _ = jax.lax.scan(stage, start, rows)
+    total = _sum(room)
+    y1 = _combined(y0, jnp.asarray(tableau.weights, real), total)
     zero = jax.tree.map(jnp.zeros_like, y0)
-    failed = ok != dfx.RESULTS.successful
-    error = _combine(zero, tableau.errors, total)
-    error = jax.tree.map(lambda e: jnp.where(failed, jnp.inf, e), error)
+    error = _combined(zero, jnp.asarray(tableau.errors, real), total)
+    error = jax.tree.map(lambda e: jnp.where(ok == fine, e, jnp.inf), error)
     rates = tuple(term.vf(t1, y1, args) for term in terms)
     k1 = _sum([term.prod(rate, s) for term, rate, s in zip(terms, rates, span)])
-    return y1, error, dict(y0=y0, y1=y1, k0=total[0], k1=k1), rates, ok
+    return y1, error, dict(y0=y0, y1=y1, k0=_sum(first), k1=k1), rates, ok
 
 
 class _Relative(lx.AbstractLinearSolver):
@@ -366,12 +388,9 @@ def _norm(y: PyTree[Array]) -> Array:
     return jnp.sqrt(sum(jnp.sum(a * a) for a in leaves) / sum(a.size for a in leaves))
 
 
-def _combine(y: PyTree[Array], weights, increments: Sequence[PyTree[Array]]) -> PyTree[Array]:
-    """y plus the weighted sum of increments."""
-    for weight, increment in zip(weights, increments):
-        if not (isinstance(weight, float | np.floating) and weight == 0):
-            y = jax.tree.map(lambda y, k, w=weight: y + w * k, y, increment)
-    return y
+def _combined(y: PyTree[Array], weights: Array, increments: PyTree[Array]) -> PyTree[Array]:
+    """y plus the weighted sum of increments that are stacked along the first axis."""
+    return jax.tree.map(lambda y, k: y + jnp.tensordot(weights, k, axes=1), y, increments)
 
 
 def _sum(trees: Sequence[PyTree[Array]]) -> PyTree[Array]:

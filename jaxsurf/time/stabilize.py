@@ -63,11 +63,12 @@ def upwinding(
     method: AbstractMethod = DCPSE(order=2),
     strength: float = 1.0,
 ) -> Stencil:
-    r"""What turns central differences along a flow into one-sided ones, of first order.
+    r"""The viscosity of upwind differences, of first order.
 
-    Diffusion along the stream, $\nabla\cdot\left(\tfrac{\alpha h |v|}{2}\,
-    \hat v \hat v^{\mathsf T}\,\nabla u\right)$ with h the distance to the nearest neighbour: on
-    a line of points, central differences plus this with α = 1 are upwind differences.
+    $\nabla\cdot\left(\tfrac{\alpha h |v|}{2}\,\nabla u\right)$ with h the distance to the nearest
+    neighbour: on a line of points, central differences plus this with α = 1 are upwind
+    differences. It acts in all directions, because damping along the stream alone leaves
+    growing modes on scattered points.
 
     Args:
         cloud: n points in d dimensions with unit normals.
@@ -80,7 +81,7 @@ def upwinding(
         The damping, to be added to the right-hand side: `stabilization=` of the problems.
 
     Accuracy: first order; `hyperviscosity` costs accuracy of higher order only.
-    Differentiable: as `diffusion`; zeros of the velocity excepted.
+    Differentiable: as `diffusion`, where the velocity does not vanish.
     Raises:
         ValueError: as `diffusion`; a velocity of the wrong shape.
     """
@@ -93,6 +94,4 @@ def upwinding(
         offsets = cloud.points[from_nearest.indices[:, 1]] - cloud.points
         spacing = jnp.linalg.norm(offsets, axis=1)
     speed = jnp.linalg.norm(velocity, axis=1)
-    size = jnp.where(speed > 0, 0.5 * strength * spacing / jnp.where(speed > 0, speed, 1), 0)
-    tensor = size[:, None, None] * velocity[:, :, None] * velocity[:, None, :]
-    return diffusion(cloud, tensor, neighbors=neighbors, method=method)
+    return diffusion(cloud, 0.5 * strength * spacing * speed, neighbors=neighbors, method=method)

@@ -1,0 +1,193 @@
+"""IMEX and SDIRK steps: order, stiffness, failure, derivatives, no matrices."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+
+import jaxsurf as js
+from jaxsurf.time.implicit import _IMEX, _SDIRK
+
+CLOUD = js.sphere(300)
+LAPLACIAN = js.laplace_beltrami(CLOUD)
+SOLVERS = [
+    js.IMEX(order=2),
+    js.IMEX(order=3),
+    js.IMEX(order=4),
+    js.SDIRK(order=3),
+    js.SDIRK(order=4),
+]
+NAMES = [f"{type(s).__name__}{s.scheme}" for s in SOLVERS]
+
+
+def trees(order):
+    """Conditions for a Runge–Kutta method of this order: b·φ and its value, for b, c, A."""
+    yield lambda b, c, A: b.sum(), 1
+    if order >= 2:
+        yield lambda b, c, A: b @ c, 1 / 2
+    if order >= 3:
+        yield lambda b, c, A: b @ c**2, 1 / 3
+        yield lambda b, c, A: b @ A @ c, 1 / 6
+    if order >= 4:
+        yield lambda b, c, A: b @ c**3, 1 / 4
+        yield lambda b, c, A: (b * c) @ A @ c, 1 / 8
+        yield lambda b, c, A: b @ A @ c**2, 1 / 12
+
+
+@pytest.mark.parametrize("order, tableau", [*_IMEX.items(), *_SDIRK.items()])
+def test_tableaus_satisfy_the_order_conditions(order, tableau):
+    """Also mixed ones (explicit and implicit matrices), and one order lower when embedded."""
+    implicit = tableau.implicit + np.diag(tableau.diagonal)
+    explicit = tableau.explicit
+    assert np.ptp(tableau.diagonal[1:]) == 0
+    b, c = tableau.weights, tableau.nodes
+    matrices = [implicit] if order in _SDIRK and tableau is _SDIRK[order] else [implicit, explicit]
+    for A in matrices:
+        np.testing.assert_allclose(A.sum(axis=1), c, atol=1e-12)
+        for condition, value in trees(order):
+            assert condition(b, c, A) == pytest.approx(value, abs=1e-12)
+        for condition, value in trees(order - 1):
+            assert condition(b - tableau.errors, c, A) == pytest.approx(value, abs=1e-12)
+
+
+def reaction(t, u, args):
+    return u - u**3 + 0.3 * jnp.sin(t) * args
+
+
+def problem(factor=1.0, laplacian=LAPLACIAN):
+    return js.AdvectionDiffusionReaction(laplacian, diffusivity=factor, reaction=reaction)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    u0 = jnp.exp(CLOUD.points[:, 0]) - 1
+    tight = dict(solver=dfx.Dopri8(), rtol=1e-11, atol=1e-11)
+    return u0, js.integrate(problem(), u0, t1=0.5, args=1.0, **tight).ys[-1]
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=NAMES)
+def test_order(solver, exact):
+    u0, expected = exact
+    errors = []
+    for steps in (10, 20):
+        u = js.integrate(problem(), u0, t1=0.5, args=1.0, solver=solver, dt0=0.5 / steps).ys[-1]
+        errors.append(float(jnp.linalg.norm(u - expected) / jnp.linalg.norm(expected)))
+    largest = {2: 2e-3, 3: 5e-4, 4: 1e-4}[solver.scheme]
+    assert errors[-1] < largest
+    # Stiff modes reduce the order of the fourth-order SDIRK method.
+    assert np.log2(errors[0] / errors[1]) > min(solver.scheme, 3) - 0.6
+
+
+@pytest.mark.parametrize("solver", [js.IMEX(order=3), js.SDIRK(order=3)], ids=["IMEX", "SDIRK"])
+def test_long_steps_damp_noise(solver):
+    noise = jnp.asarray(np.random.default_rng(0).normal(size=CLOUD.n))
+    radius = js.spectral_estimate(LAPLACIAN).radius
+    dt = 1e4 / radius
+    u = js.integrate(
+        js.AdvectionDiffusionReaction(LAPLACIAN), noise, t1=2 * dt, dt0=dt, solver=solver
+    )
+    assert float(jnp.ptp(u.ys[-1])) < 1e-3
+
+
+def test_stiff_reaction():
+    """Robertson's kinetics at every point, rate constants 0.04 to 3e7, against SciPy's Radau."""
+    from scipy.integrate import solve_ivp
+
+    def rate(u):
+        a, b, c = u[..., 0], u[..., 1], u[..., 2]
+        slow, fast = 0.04 * a - 1e4 * b * c, 3e7 * b**2
+        return jnp.stack([-slow, slow - fast, fast], axis=-1)
+
+    reference = solve_ivp(
+        lambda t, u: np.asarray(rate(u)), (0, 40), [1, 0, 0], method="Radau", rtol=1e-8, atol=1e-12
+    ).y[:, -1]
+    cloud = js.sphere(100)
+    u0 = jnp.zeros((100, 3)).at[:, 0].set(1)
+    kinetics = js.AdvectionDiffusionReaction(
+        js.laplace_beltrami(cloud), diffusivity=0.1, reaction=lambda t, u, args: rate(u)
+    )
+    # A tolerance for the linear systems that small concentrations need too.
+    solver = js.SDIRK(order=4, tolerance=1e-12)
+    solution = js.integrate(kinetics, u0, t1=40.0, solver=solver, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(solution.ys[-1], np.tile(reference, (100, 1)), rtol=1e-3)
+    assert int(solution.stats["num_steps"]) < 200
+
+
+def largest_array(jaxpr) -> int:
+    """Size of the largest array that a program makes, inner programs included."""
+    sizes = [0]
+    for equation in jaxpr.eqns:
+        sizes += [
+            np.prod(v.aval.shape, dtype=int) for v in equation.outvars if hasattr(v.aval, "shape")
+        ]
+        for inner in jax.tree.leaves(
+            list(equation.params.values()),
+            is_leaf=lambda x: isinstance(x, jax.extend.core.Jaxpr | jax.extend.core.ClosedJaxpr),
+        ):
+            if isinstance(inner, jax.extend.core.ClosedJaxpr):
+                inner = inner.jaxpr
+            if isinstance(inner, jax.extend.core.Jaxpr):
+                sizes.append(largest_array(inner))
+    return max(sizes)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [js.RKC2(max_stages=30), js.IMEX(order=3), js.SDIRK(order=3)],
+    ids=["RKC2", "IMEX", "SDIRK"],
+)
+def test_derivatives(solver):
+    """In the state, the operator, a coefficient and `args`; and no n × n array on the way."""
+    u0 = jnp.exp(CLOUD.points[:, 2]) - 1
+    inputs = (u0, LAPLACIAN.weights, jnp.asarray(0.8), jnp.asarray(0.5))
+    rng = np.random.default_rng(0)
+    direction = jax.tree.map(lambda x: x * jnp.asarray(rng.normal(size=x.shape)), inputs)
+
+    def scalar(inputs, adjoint=dfx.RecursiveCheckpointAdjoint(checkpoints=2)):
+        u0, weights, factor, args = inputs
+        changed = problem(factor, js.Stencil(LAPLACIAN.indices, weights))
+        u = js.integrate(changed, u0, t1=0.2, dt0=0.1, solver=solver, args=args, adjoint=adjoint)
+        return jnp.sum(u.ys[-1] ** 2 * (1 + CLOUD.points[:, 0]))
+
+    value, gradient = jax.jit(scalar), jax.jit(jax.grad(scalar))
+    moved = lambda h: jax.tree.map(lambda x, d: x + h * d, inputs, direction)
+    slope = lambda h: float(value(moved(h)) - value(moved(-h))) / (2 * h)
+    expected = (4 * slope(1e-4) - slope(2e-4)) / 3
+    products = jax.tree.map(lambda g, d: float(jnp.vdot(g, d)), gradient(inputs), direction)
+    np.testing.assert_allclose(sum(jax.tree.leaves(products)), expected, rtol=1e-6)
+    tangent = jax.jit(
+        lambda: jax.jvp(lambda x: scalar(x, dfx.ForwardMode()), (inputs,), (direction,))
+    )
+    np.testing.assert_allclose(float(tangent()[1]), expected, rtol=1e-6)
+
+    program = jax.make_jaxpr(jax.grad(scalar))(inputs)
+    assert largest_array(program.jaxpr) < CLOUD.n**2 / 2
+
+
+def test_linear_systems_that_are_not_solved_are_reported():
+    u0 = jnp.exp(CLOUD.points[:, 2])
+    weak = js.IMEX(order=3, solver=lx.BiCGStab(rtol=0.0, atol=1e-10, max_steps=2), tolerance=1e-10)
+    with pytest.raises(js.IntegrationError, match="linear system") as caught:
+        js.integrate(js.AdvectionDiffusionReaction(LAPLACIAN), u0, t1=1.0, dt0=0.5, solver=weak)
+    assert caught.value.time == 0.0
+    np.testing.assert_array_equal(caught.value.state, u0)
+
+
+def test_newton_that_fails_shortens_the_step():
+    """u' = -u³ · 1e4 from u = 10: a step of the whole interval is out of reach."""
+    one = js.AdvectionDiffusionReaction(LAPLACIAN, reaction=lambda t, u, args: -1e4 * u**3)
+    u0 = jnp.full(CLOUD.n, 10.0)
+    solver = js.SDIRK(order=3, newton_steps=2)
+    solution = js.integrate(one, u0, t1=1e-2, solver=solver, rtol=1e-3, atol=1e-6)
+    exact = 1 / np.sqrt(1 / 100 + 2e4 * 1e-2)
+    np.testing.assert_allclose(solution.ys[-1], exact, rtol=1e-2)
+    with pytest.raises(js.IntegrationError, match="diverged"):
+        js.integrate(one, u0, t1=10.0, dt0=10.0, solver=solver)
+
+
+@pytest.mark.parametrize("kind", [js.IMEX, js.SDIRK])
+def test_unknown_order(kind):
+    with pytest.raises(ValueError, match="order = 7, there are"):
+        kind(order=7)

@@ -1,0 +1,1 @@
+"""Steady problems, eigenmodes and what is made of them."""

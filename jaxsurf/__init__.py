@@ -3,10 +3,20 @@
 Points, then neighbours, then stencils, then operators: `import jaxsurf as js`.
 """
 
+from .borders import Border as Border
+from .borders import border_conormals as border_conormals
+from .borders import detect_border as detect_border
+from .borders import find_border as find_border
+from .boundary import Closure as Closure
+from .boundary import close as close
 from .cells import SearchCapacity as SearchCapacity
 from .cells import allocate as allocate
 from .cells import search_neighbors as search_neighbors
 from .cloud import PointCloud as PointCloud
+from .conditions import Condition as Condition
+from .conditions import dirichlet as dirichlet
+from .conditions import neumann as neumann
+from .conditions import robin as robin
 from .curvature import gauss_curvature as gauss_curvature
 from .curvature import mean_curvature as mean_curvature
 from .curvature import mean_curvature_vector as mean_curvature_vector

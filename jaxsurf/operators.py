@@ -323,7 +323,7 @@ def _build(cloud, neighbors, method, target, throw) -> Stencil:
             weights = laplacian
     _check_sizes(cloud, neighbors, method, target, throw)
     if weights is None:
-        weights = _weights(cloud, neighbors, method, target)
+        weights = stencil_weights(cloud, neighbors, method, target)
     values, diagnostics = weights
     components = values.shape[1:-1]
     stencil = Stencil(neighbors.indices.T, values, components, (), diagnostics)
@@ -333,7 +333,7 @@ def _build(cloud, neighbors, method, target, throw) -> Stencil:
 
 
 @eqx.filter_jit
-def _weights(cloud, neighbors, method, target, rows=None):
+def stencil_weights(cloud, neighbors, method, target, rows=None):
     """Weights `(k, *components, r)` and diagnostics of all stencils, or of those of some rows."""
     rows = jnp.arange(cloud.n) if rows is None else rows
     radius = neighbors.radius
@@ -358,7 +358,7 @@ def _adapted(cloud, method, throw) -> tuple[Neighbors, tuple | None]:
     k = min(method.neighbor_count(cloud.dim), available)
     neighbors = find_neighbors(cloud, k, throw=throw)
     _check_sizes(cloud, neighbors, method, Laplacian(), throw)
-    weights = _weights(cloud, neighbors, method, Laplacian())
+    weights = stencil_weights(cloud, neighbors, method, Laplacian())
     poor = np.flatnonzero(on & _is_poor(*weights))
     widths = [min(int(k * growth), available) for growth in _GROWTH]
     if not poor.size or widths[-1] == k:
@@ -371,7 +371,7 @@ def _adapted(cloud, method, throw) -> tuple[Neighbors, tuple | None]:
     still = np.ones(rows.size, bool)
     for width in widths[:-1]:
         narrow = Neighbors(jnp.asarray(indices), jnp.asarray(mask & _first(width, mask)))
-        again = _is_poor(*_weights(cloud, narrow, method, Laplacian(), jnp.asarray(rows)))
+        again = _is_poor(*stencil_weights(cloud, narrow, method, Laplacian(), jnp.asarray(rows)))
         chosen = np.where(still & ~again, width, chosen)
         still &= again
     widest = chosen.max()

@@ -1,0 +1,394 @@
+r"""Borders of surfaces: which points lie on one, their order along it, outward conormals.
+
+The conormal $\nu = \tau\times n$ is tangent to the surface and normal to its border. The tangent
+$\tau$ of the border comes from polynomials through up to five border points in a row, so that
+it is as accurate as the stencils that use it; rows end at corners.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from .cloud import PointCloud, is_concrete
+from .frames import tangent_frames
+from .neighbors import nearest
+from .shapes.meshes import TriangleMesh
+
+# Points in a row that the border is interpolated through.
+_ROW = 5
+# A corner turns by more than this, in radians, and this many times as much as the points beside
+# it; whatever turns by more than the last is one.
+_TURN, _TIMES, _SHARP = 0.3, 2.5, 1.0
+# Along a border, the second neighbour is off by at least this cosine from the first.
+_ASIDE = 0.5
+# Neighbours looked at for the largest empty angle, and the angle that makes a border.
+_RING, _GAP = 16, 2.1
+
+
+class Border(eqx.Module):
+    """The border points of a cloud, and for each the rows of border points around it.
+
+    A point inside a smooth piece has the same row twice; a corner one on each side. On a plane
+    curve, whose border is its ends, a row is the end and the point next to it.
+
+    Args:
+        points: the border points, `(m,)`, piece by piece in order.
+        rows: border points around each, in order with the surface on the left, `(2, m, r)`.
+        mask: which of them count, `(2, m, r)`.
+    """
+
+    points: Int[Array, " m"]
+    rows: Int[Array, "2 m r"]
+    mask: Bool[Array, "2 m r"]
+
+    @property
+    def corners(self) -> Bool[Array, " m"]:
+        """True where two smooth pieces meet."""
+        return jnp.any(self.rows[0] != self.rows[1], axis=1)
+
+    def conormals(self, cloud: PointCloud) -> Float[Array, "m d"]:
+        """Outward unit conormals; at a corner the mean direction of both sides."""
+        sides = [self.side_conormals(cloud, side) for side in (0, 1)]
+        total = sides[0] + sides[1]
+        return total / jnp.linalg.norm(total, axis=1, keepdims=True)
+
+    def side_conormals(self, cloud: PointCloud, side: int) -> Float[Array, "m d"]:
+        """Outward unit conormals of the piece before (0) or after (1) each point."""
+        slot = jnp.arange(len(self.points))
+        return self.at(cloud, side, slot, cloud.points[self.points])[2]
+
+    def at(self, cloud: PointCloud, side, slot, near: Float[Array, "p d"]):
+        """Foot points on the border, and the geometry there.
+
+        Args:
+            cloud: the points and normals.
+            side: which row of a point to follow, 0 or 1 or `(p,)`.
+            slot: place in `points` of the border point close by, `(p,)`.
+            near: positions, `(p, d)`.
+
+        Returns:
+            Foot points `(p, d)`, unit normals and outward conormals there, and the weights `(p, r)`
+            by which anything known on the border is carried to the foot.
+        """
+        rows, mask = self.rows[side, slot], self.mask[side, slot]
+        points, normals = cloud.points[rows], cloud.normals[rows]
+        if cloud.dim == 2:
+            return _end(points, normals)
+        centre = cloud.points[self.points[slot]]
+        last = jnp.sum(mask, axis=1) - 1
+        chord = jnp.take_along_axis(points, last[:, None, None], axis=1)[:, 0] - points[:, 0]
+        axis = chord / jnp.linalg.norm(chord, axis=1, keepdims=True)
+        nodes = jnp.einsum("prd,pd->pr", points - centre[:, None], axis)
+        x = jnp.einsum("pd,pd->p", near - centre, axis)
+        for _ in range(_NEWTON):
+            value, slope = _lagrange(nodes, mask, x)
+            foot = jnp.einsum("pr,prd->pd", value, points)
+            tangent = jnp.einsum("pr,prd->pd", slope, points)
+            away = jnp.einsum("pd,pd->p", near - foot, tangent)
+            x = x + away / jnp.sum(tangent**2, axis=1)
+        value, slope = _lagrange(nodes, mask, x)
+        foot = jnp.einsum("pr,prd->pd", value, points)
+        tangent = jnp.einsum("pr,prd->pd", slope, points)
+        normal = _unit(jnp.einsum("pr,prd->pd", value, normals))
+        return foot, normal, _unit(jnp.cross(tangent, normal)), value
+
+
+_NEWTON = 3
+
+
+def _unit(v):
+    return v / jnp.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def _end(points, normals):
+    """The end of a plane curve: the conormal leads away from the point next to it."""
+    normal = normals[:, 0]
+    tangent = tangent_frames(normal)[:, 0]
+    inward = jnp.einsum("pd,pd->p", points[:, 1] - points[:, 0], tangent)
+    value = jnp.zeros(points.shape[:2], points.dtype).at[:, 0].set(1)
+    return points[:, 0], normal, -jnp.sign(inward)[:, None] * tangent, value
+
+
+def _lagrange(nodes, mask, x):
+    """Values and slopes at x of the polynomials that are 1 at one node and 0 at the others."""
+    r = nodes.shape[1]
+    others = mask[:, None] & ~jnp.eye(r, dtype=bool)
+    gap = jnp.where(others, nodes[:, :, None] - nodes[:, None], 1)
+    step = jnp.where(others, x[:, None, None] - nodes[:, None], gap)
+    factor = step / gap
+    value = jnp.where(mask, jnp.prod(factor, axis=2), 0)
+    # The product rule, without a division by factors that vanish at the nodes.
+    without = jnp.where(jnp.eye(r, dtype=bool), 1, factor[:, :, None])
+    terms = jnp.where(others, jnp.prod(without, axis=3) / gap, 0)
+    return value, jnp.where(mask, jnp.sum(terms, axis=2), 0)
+
+
+def border_conormals(cloud: PointCloud, border: Border | None = None) -> Float[Array, "m d"]:
+    r"""Outward conormals at the points marked in `cloud.boundary`.
+
+    $\nu = \tau \times n$, with $\tau$ the direction of the border. At a corner, the mean
+    direction of both sides.
+
+    Args:
+        cloud: points and normals; `boundary` must be set.
+        border: from `find_border`, for traced points; found if None.
+
+    Returns:
+        Unit vectors `(m, d)`, in the order of the indices of the m marked points.
+
+    Accuracy: angle O(h⁴) on smooth borders (`tests/test_boundary.py`).
+    Differentiable: forward and reverse, in points and normals, for a given border.
+    Raises:
+        ValueError: as `find_border`.
+
+    Example:
+        >>> bowl = lambda s: (jnp.sin(s), -jnp.cos(s))
+        >>> cap = js.surface_of_revolution(bowl, 800)
+        >>> border = cap.points[cap.boundary]
+        >>> exact = jnp.cross(jnp.cross(jnp.array([0.0, 0.0, 1.0]), border), border)
+        >>> exact = -exact / jnp.linalg.norm(exact, axis=1, keepdims=True)
+        >>> bool(jnp.abs(js.border_conormals(cap) - exact).max() < 1e-3)
+        True
+    """
+    border = find_border(cloud) if border is None else border
+    return border.conormals(cloud)[jnp.argsort(border.points)]
+
+
+def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
+    """The points marked in `cloud.boundary`, put in order along the border.
+
+    Every border point is linked to its nearest one, and to the nearest one on the other side of
+    it; or the border edges of a mesh say how.
+
+    Args:
+        cloud: n points with `boundary`; concrete.
+        mesh: a mesh whose vertices are the points of the cloud, in the same order.
+
+    Returns:
+        The border, with the surface on its left.
+
+    Raises:
+        ValueError: traced arrays; no point marked; a marked point without a neighbour along the
+            border (named by index); a mesh with another number of vertices, or without border.
+    """
+    if not is_concrete(cloud.points, cloud.normals, cloud.boundary):
+        raise ValueError("find_border needs concrete arrays; find it first and pass it on")
+    if mesh is not None:
+        if len(mesh.vertices) != cloud.n:
+            raise ValueError(f"the mesh has {len(mesh.vertices)} vertices, the cloud {cloud.n}")
+        if mesh.closed:
+            raise ValueError("the mesh has no border edges")
+        paths = [(loop, True) for loop in mesh.border_loops]
+        return _with_rows(cloud, paths)
+    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    marked = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary) & on
+    if not marked.any():
+        raise ValueError("no point is marked in cloud.boundary; see detect_border")
+    points = np.asarray(cloud.points, float)
+    inside = _inward(points, np.flatnonzero(on), np.flatnonzero(marked))
+    if cloud.dim == 2:
+        return _ends(points, np.flatnonzero(on), np.flatnonzero(marked))
+    names = np.flatnonzero(marked)
+    paths = []
+    for path, closed in _paths(_links(points[names], names)):
+        if _leftness(cloud, names[path], inside[path], closed) < 0:
+            path = path[::-1]
+        paths.append((names[path], closed))
+    return _with_rows(cloud, paths)
+
+
+def detect_border(cloud: PointCloud, *, k: int = _RING, gap: float = _GAP) -> Bool[Array, " n"]:
+    """Points of a cloud that look like border points, for `PointCloud.boundary`.
+
+    Seen from an inner point the neighbours lie all around; at a border they leave an angle
+    free, about a half turn.
+
+    Args:
+        cloud: n points with unit normals, concrete.
+        k: number of neighbours looked at, the point included.
+        gap: free angle in the tangent plane that makes a border point, in radians, below π.
+
+    Returns:
+        Mask `(n,)`. On very uneven points it may name inner points and leave border points
+        out: look at it before use.
+
+    Raises:
+        ValueError: traced arrays; k or gap out of range.
+
+    Example:
+        >>> bowl = lambda s: (jnp.sin(s), -jnp.cos(s))
+        >>> cap = js.surface_of_revolution(bowl, 800)
+        >>> bool((js.detect_border(cap) == cap.boundary).all())
+        True
+    """
+    if not is_concrete(cloud.points, cloud.normals):
+        raise ValueError("detect_border needs concrete arrays")
+    if not 3 <= k <= cloud.n:
+        raise ValueError(f"k = {k} neighbours, expected 3 to {cloud.n}")
+    if not 0 < gap < np.pi:
+        raise ValueError(f"gap = {gap}, expected an angle between 0 and π")
+    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    rows = np.flatnonzero(on)
+    points, normals = np.asarray(cloud.points, float)[rows], np.asarray(cloud.normals)[rows]
+    k = min(k, len(rows)) if cloud.dim == 3 else 3
+    slots, mask = nearest(points, normals, cKDTree(points), k, 0.0)
+    frames = np.asarray(tangent_frames(jnp.asarray(normals)))[:, :-1]
+    offsets = np.einsum("nkd,ntd->nkt", points[slots] - points[:, None], frames)[:, 1:]
+    used = mask[:, 1:]
+    found = np.zeros(cloud.n, bool)
+    if cloud.dim == 2:
+        side = np.where(used, np.sign(offsets[..., 0]), 0)
+        found[rows] = np.abs(side.sum(axis=1)) == used.sum(axis=1)
+    else:
+        angle = np.where(used, np.arctan2(offsets[..., 1], offsets[..., 0]), np.nan)
+        angle = np.sort(angle, axis=1)  # unused slots last
+        step = np.diff(angle, axis=1)
+        around = 2 * np.pi - (np.nanmax(angle, axis=1) - np.nanmin(angle, axis=1))
+        found[rows] = np.maximum(np.nanmax(step, axis=1, initial=0), around) > gap
+    return jnp.asarray(found)
+
+
+# --- order along the border ----------------------------------------------------------------
+
+
+def _inward(points, on, border):
+    """Mean offset from each border point to the points around it."""
+    count = min(4 * points.shape[1], len(on))
+    near = cKDTree(points[on]).query(points[border], count)[1]
+    return (points[on][near] - points[border][:, None]).mean(axis=1)
+
+
+def _links(points, names) -> list[list[int]]:
+    """For every border point the one or two that come next to it."""
+    count = min(len(points), 12)
+    if count < 2:
+        raise ValueError(f"border point {names[0]} is alone; a border has at least 2 points")
+    distance, near = cKDTree(points).query(points, count)
+    d = (points[near] - points[:, None])[:, 1:]
+    near, distance = near[:, 1:], distance[:, 1:]
+    first = d[:, 0] / distance[:, :1]
+    cosine = np.einsum("nkd,nd->nk", d, first) / distance
+    other = (cosine < _ASIDE) & (distance < 4 * np.median(distance[:, 0]))
+    second = np.where(other.any(axis=1), near[np.arange(len(near)), np.argmax(other, axis=1)], -1)
+    wanted = {(i, int(j)) for i, j in enumerate(near[:, 0])}
+    wanted |= {(i, int(j)) for i, j in enumerate(second) if j >= 0}
+    pairs = {(min(p), max(p)) for p in wanted}
+    length = {p: float(np.linalg.norm(points[p[0]] - points[p[1]])) for p in pairs}
+    links: list[list[int]] = [[] for _ in names]
+    # Links that both ends ask for come first, then short ones.
+    mutual = {p for p in pairs if p in wanted and p[::-1] in wanted}
+    for i, j in sorted(pairs, key=lambda p: (p not in mutual, length[p])):
+        if len(links[i]) < 2 and len(links[j]) < 2:
+            links[i].append(j)
+            links[j].append(i)
+    lone = [i for i, near_by in enumerate(links) if not near_by]
+    if lone:
+        raise ValueError(f"border point {names[lone[0]]} has no neighbour along the border")
+    return links
+
+
+def _paths(links: list[list[int]]) -> list[tuple[np.ndarray, bool]]:
+    """The chains of linked points, and whether each closes."""
+    seen = np.zeros(len(links), bool)
+    paths = []
+    ends = [i for i, near in enumerate(links) if len(near) == 1]
+    for start in [*ends, *range(len(links))]:
+        if seen[start]:
+            continue
+        path, here = [start], start
+        seen[start] = True
+        while True:
+            onward = [j for j in links[here] if not seen[j]]
+            if not onward:
+                break
+            here = onward[0]
+            seen[here] = True
+            path.append(here)
+        paths.append((np.array(path), len(path) > 2 and start in links[here]))
+    return paths
+
+
+def _leftness(cloud, path, inside, closed) -> float:
+    """Positive if the surface lies on the left of a path, seen from where the normals point."""
+    points, normals = np.asarray(cloud.points, float)[path], np.asarray(cloud.normals)[path]
+    ahead = np.roll(points, -1, axis=0) - points if closed else np.gradient(points, axis=0)
+    return float(np.sum(np.cross(normals, ahead) * inside))
+
+
+def _with_rows(cloud, paths) -> Border:
+    """The rows of border points around each: within a piece between two corners."""
+    names: list[int] = []
+    rows: list[list] = [[], []]
+    masks: list[list] = [[], []]
+    for path, closed in paths:
+        m = len(path)
+        corner = _corners(cloud, path, closed)
+        for here in range(m):
+            names.append(path[here])
+            for side in (0, 1):
+                reach = [_reach(corner, here, step, closed, most=_ROW - 1) for step in (-1, 1)]
+                if corner[here] and all(reach):
+                    reach[1 - side] = 0
+                low, high = _window(*reach)
+                window = path[(here + np.arange(-low, high + 1)) % m]
+                padding = _ROW - len(window)
+                rows[side].append(np.pad(window, (0, padding), mode="edge"))
+                masks[side].append(np.arange(_ROW) < len(window))
+    unique, count = np.unique(names, return_counts=True)
+    if count.max() > 1:
+        raise ValueError(f"point {unique[np.argmax(count)]} lies on {count.max()} borders")
+    return Border(
+        jnp.asarray(np.array(names, np.int32)),
+        jnp.asarray(np.array(rows, np.int32)),
+        jnp.asarray(np.array(masks)),
+    )
+
+
+def _reach(corner, here, step, closed, most) -> int:
+    """How many points of the same piece follow in a direction."""
+    m, count = len(corner), 0
+    most = min(most, (m - 1) // 2) if closed else most
+    while count < most:
+        place = here + step * (count + 1)
+        if not closed and not 0 <= place < m:
+            break
+        count += 1
+        if corner[place % m]:
+            break
+    return count
+
+
+def _window(before: int, after: int) -> tuple[int, int]:
+    """How many points on either side: evenly, unless one side has too few."""
+    half = (_ROW - 1) // 2
+    low, high = min(before, half), min(after, half)
+    low = min(before, _ROW - 1 - high)
+    high = min(after, _ROW - 1 - low)
+    return low, high
+
+
+def _corners(cloud, path, closed) -> np.ndarray:
+    """Points where the border turns sharply, the ends of an open path included."""
+    points = np.asarray(cloud.points, float)[path]
+    if len(path) < 3:
+        return np.ones(len(path), bool)
+    ahead = np.roll(points, -1, axis=0) - points
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    turn = np.arccos(np.clip(np.sum(ahead * np.roll(ahead, 1, axis=0), axis=1), -1, 1))
+    beside = np.maximum(np.roll(turn, 1), np.roll(turn, -1))
+    corner = (turn > _SHARP) | ((turn > _TURN) & (turn > _TIMES * beside))
+    if not closed:
+        corner[[0, -1]] = True
+    return corner
+
+
+def _ends(points, on, border) -> Border:
+    """Rows at the ends of a plane curve: each end and its nearest point."""
+    near = on[cKDTree(points[on]).query(points[border], 2)[1][:, 1]]
+    rows = np.stack([border, near], axis=1).astype(np.int32)
+    rows = np.broadcast_to(rows, (2, *rows.shape))
+    return Border(jnp.asarray(border), jnp.asarray(rows), jnp.ones(rows.shape, bool))

@@ -1,0 +1,335 @@
+r"""Boundary conditions, eliminated: bound values as an affine function of the free ones.
+
+Points are *free* (the equation holds there) or *bound* (their value follows from a condition).
+A condition $a\,u + b\,\partial_\nu u = g$ at a bound point, its conormal derivative
+replaced by a one-sided stencil $\sum_j w_j u_j$ over the point itself and free neighbours, gives
+
+$$u_i = \frac{g_i - b \sum_{j \ne i} w_j u_j}{a + b\,w_i}, \qquad\text{together}\quad u = E v + e.$$
+
+No bound value depends on another, so that E is explicit. A steady problem $A u = f$ becomes
+$P A E v = P (f - A e)$ on the free points (P picks them), a problem in time
+$\dot v = P\,F(t, E v + e(t))$.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+from jaxtyping import Array, Bool, Float, Int
+
+from .borders import Border, find_border
+from .cloud import PointCloud, is_concrete
+from .conditions import Condition, checked_conditions
+from .neighbors import Neighbors, nearest_of
+from .operators import stencil_weights
+from .stencils.gfdm import GFDM
+from .stencils.method import AbstractMethod
+from .stencils.stencil import Stencil
+from .stencils.targets import Gradient
+
+# The pivot a + b w_i has to be more than this share of the sizes it is the sum of.
+_PIVOT = 1e-3
+
+
+class Source(eqx.Module):
+    """Prescribed values of one condition, as they are added to the bound values.
+
+    Args:
+        slots: which bound points, `(e,)`.
+        factor: what the value is multiplied by, `(e,)`.
+        pick: which of the condition's values, `(e,)`.
+        condition: where the values come from.
+    """
+
+    slots: Int[Array, " e"]
+    factor: Float[Array, " e"]
+    pick: Int[Array, " e"]
+    condition: Condition
+
+    def at(self, t) -> Float[Array, "e *c"]:
+        g = self.condition.at(t)
+        g = jnp.broadcast_to(g, (self.condition.m, *g.shape[1:]))[self.pick]
+        return self.factor.reshape(-1, *[1] * (g.ndim - 1)) * g
+
+
+class Closure(eqx.Module):
+    r"""Fills in the bound values of a field: $u = E v + e(t)$.
+
+    Only the rows of bound points are stored; rows of E at free points are those of the
+    identity, and bound rows refer to free points only, hence $E^2 = E$.
+
+    Args:
+        n: number of points.
+        rows: the bound points, `(m,)`.
+        indices: free points that each bound value depends on, `(k, m)`.
+        weights: with which weight, `(k, m)`; zero in padded slots.
+        sources: prescribed values.
+    """
+
+    n: int = eqx.field(static=True)
+    rows: Int[Array, " m"]
+    indices: Int[Array, "k m"]
+    weights: Float[Array, "k m"]
+    sources: tuple[Source, ...] = ()
+
+    @property
+    def m(self) -> int:
+        """Number of bound points."""
+        return self.rows.shape[0]
+
+    @property
+    def bound(self) -> Bool[Array, " n"]:
+        """True at bound points."""
+        return jnp.zeros(self.n, bool).at[self.rows].set(True)
+
+    def __call__(self, u: Float[Array, "n *c"], t=0.0) -> Float[Array, "n *c"]:
+        """The field with its bound values replaced by those that follow at time t."""
+        u = self._field(u)
+        values, offset = self._linear(u), self._offset(t)
+        if offset.ndim > values.ndim:
+            raise ValueError(f"values have components {offset.shape[1:]}, the field has none")
+        offset = offset.reshape(*offset.shape, *[1] * (values.ndim - offset.ndim))
+        return u.at[self.rows].set(values + offset)
+
+    def homogeneous(self, u: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
+        """The linear part E u, which ignores the bound values of u."""
+        u = self._field(u)
+        return u.at[self.rows].set(self._linear(u))
+
+    def offset(self, t=0.0) -> Float[Array, "n *c"]:
+        """The affine part e at time t; zero at free points."""
+        values = self._offset(t)
+        return jnp.zeros((self.n, *values.shape[1:]), values.dtype).at[self.rows].set(values)
+
+    def restrict(self, u: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
+        """The field with its bound values set to zero."""
+        return self._field(u).at[self.rows].set(0)
+
+    def extend(self, u: Float[Array, "p *c"], t=0.0) -> Float[Array, "n *c"]:
+        """A field of the first p points, for a cloud with ghosts after them, filled in."""
+        u = jnp.asarray(u)
+        return self(jnp.concatenate([u, jnp.zeros((self.n - len(u), *u.shape[1:]), u.dtype)]), t)
+
+    @property
+    def stencil(self) -> Stencil:
+        """E as an operator on all points. It stores k weights per point, free ones too."""
+        k = self.indices.shape[0]
+        own = jnp.arange(self.n, dtype=self.indices.dtype)
+        indices = jnp.broadcast_to(own, (k + 1, self.n)).at[1:, self.rows].set(self.indices)
+        weights = jnp.zeros((k + 1, self.n), self.weights.dtype).at[0].set(1)
+        weights = weights.at[0, self.rows].set(0).at[1:, self.rows].set(self.weights)
+        return Stencil(indices, weights)
+
+    def to_scipy(self) -> scipy.sparse.csr_matrix:
+        """E as a CSR matrix, `(n, n)`."""
+        rows, free = np.asarray(self.rows), ~np.asarray(self.bound)
+        own = np.flatnonzero(free)
+        i = np.concatenate([own, np.broadcast_to(rows, self.indices.shape).ravel()])
+        j = np.concatenate([own, np.asarray(self.indices).ravel()])
+        weights = np.asarray(self.weights).ravel()
+        values = np.concatenate([np.ones(len(own), weights.dtype), weights])
+        matrix = scipy.sparse.csr_matrix((values, (i, j)), shape=(self.n, self.n))
+        matrix.eliminate_zeros()
+        return matrix
+
+    def _field(self, u):
+        u = jnp.asarray(u)
+        if u.ndim < 1 or u.shape[0] != self.n:
+            raise ValueError(f"field has shape {u.shape}, expected ({self.n}, ...)")
+        return u
+
+    def _linear(self, u):
+        weights = self.weights.reshape(*self.weights.shape, *[1] * (u.ndim - 1))
+        return jnp.sum(weights * u[self.indices], axis=0)
+
+    def _offset(self, t):
+        parts = [source.at(t) for source in self.sources]
+        shape = jnp.broadcast_shapes(*(part.shape[1:] for part in parts))
+        total = jnp.zeros((self.m, *shape), jnp.result_type(self.weights, *parts))
+        for source, part in zip(self.sources, parts):
+            part = part.reshape(*part.shape, *[1] * (len(shape) + 1 - part.ndim))
+            total = total.at[source.slots].add(part)
+        return total
+
+
+def close(
+    cloud: PointCloud,
+    conditions: Condition | Sequence[Condition],
+    *,
+    neighbors: Neighbors | None = None,
+    method: AbstractMethod = GFDM(degree=2),
+    border: Border | None = None,
+    throw: bool = True,
+) -> Closure:
+    r"""Eliminate boundary conditions with one-sided stencils.
+
+    The derivative along the conormal is $\nu\cdot\nabla_S u$ by the stencils of `method` over
+    the point itself and its nearest free points, so that bound values never depend on each
+    other. Dirichlet conditions need no stencil, and hold on any set of points.
+
+    Args:
+        cloud: n points with unit normals. Points under no condition are free.
+        conditions: one or several; together they may name a point twice only if they agree.
+        neighbors: lists for all n points, of which the free ones are used; if None, the
+            nearest free points are searched for (host only).
+        method: how the derivatives are computed; of the operator's order or one above.
+        border: from `find_border`, for conormals on traced points; found where needed if None.
+        throw: check stencils and pivots (on concrete arrays).
+
+    Returns:
+        The map from free values to fields that meet the conditions.
+
+    Accuracy: bound values O(h^{p+1}) for GFDM(degree=p) and DCPSE(order=p)
+    (`tests/test_boundary.py`).
+    Differentiable: forward and reverse, in points, normals, values, a, b and conormals, for
+    fixed neighbours.
+    Raises:
+        ValueError: contradictory conditions; no conormal; fewer free neighbours than the method
+            needs; a + b w_i near zero, with w_i the weight of the point itself in its conormal
+            derivative (a Robin condition of the wrong sign); each with the point.
+
+    Example:
+        >>> cloud = js.sphere(500)
+        >>> equator = jnp.abs(cloud.points[:, 2]) < 0.05
+        >>> closure = js.close(cloud, js.dirichlet(equator, 2.0))
+        >>> bool((closure(jnp.zeros(500)) == jnp.where(equator, 2.0, 0.0)).all())
+        True
+    """
+    conditions, owner = checked_conditions(cloud, conditions)
+    bound = np.concatenate([c.where[own] for c, own in zip(conditions, owner)])
+    free = np.ones(cloud.n, bool) if cloud.active is None else np.array(cloud.active)
+    free[bound] = False
+    dtype = cloud.points.dtype
+
+    parts, sources, start = [], [], 0
+    for condition, own in zip(conditions, owner):
+        rows, m = condition.where[own], int(own.sum())
+        if not m:
+            continue
+        a = jnp.broadcast_to(condition.a, condition.m)[own].astype(dtype)
+        if condition.b is None:
+            pivot, slots, weights = a, jnp.zeros((0, m), jnp.int32), jnp.zeros((0, m), dtype)
+        else:
+            b = jnp.broadcast_to(condition.b, condition.m)[own].astype(dtype)
+            nu = _conormals(cloud, condition, rows, own, border)
+            near = _free_neighbors(cloud, rows, free, neighbors, method)
+            gradient, diagnostics = stencil_weights(cloud, near, method, Gradient(), rows)
+            w = jnp.einsum("md,kdm->km", nu, gradient)
+            pivot, slots, weights = a + b * w[0], near.indices.T[1:], -b * w[1:]
+            if throw and is_concrete(w, a, b):
+                size = np.abs(a) + np.abs(b) * np.abs(w).sum(axis=0)
+                _check_stencils(rows, near, diagnostics.residual, method, cloud.dim)
+                _check_pivots(rows, np.asarray(pivot), np.asarray(size))
+        parts.append((rows, slots, weights / pivot))
+        place = jnp.arange(start, start + m)
+        sources.append(Source(place, 1 / pivot, jnp.asarray(np.flatnonzero(own)), condition))
+        start += m
+    rows, indices, weights = stacked(parts, int(np.argmax(free)))
+    return Closure(cloud.n, rows, indices, weights, tuple(sources))
+
+
+def stacked(parts, free: int):
+    """One table of rows, indices and weights; padding refers to a free point."""
+    k = max(len(slots) for _, slots, _ in parts)
+    padding = lambda x: ((0, k - len(x)), (0, 0))
+    rows = np.concatenate([rows for rows, _, _ in parts])
+    indices = [jnp.pad(jnp.asarray(s), padding(s), constant_values=free) for _, s, _ in parts]
+    weights = [jnp.pad(w, padding(w)) for _, _, w in parts]
+    return jnp.asarray(rows), jnp.concatenate(indices, axis=1), jnp.concatenate(weights, axis=1)
+
+
+# --- one-sided stencils --------------------------------------------------------------------
+
+
+def _conormals(cloud, condition, rows, own, border) -> Float[Array, "m d"]:
+    """Those of the condition; else those of the border."""
+    if condition.conormals is not None:
+        if condition.conormals.shape[1:] != (cloud.dim,):
+            shape = condition.conormals.shape
+            raise ValueError(f"conormals have shape {shape}, expected (..., {cloud.dim})")
+        return condition.conormals[own]
+    if border is None and cloud.boundary is not None:
+        border = find_border(cloud)
+    place = np.full(cloud.n, -1)
+    if border is not None:
+        place[np.asarray(border.points)] = np.arange(len(border.points))
+    lacking = place[rows] < 0
+    if lacking.any():
+        raise ValueError(
+            f"no conormal at point {rows[np.argmax(lacking)]}: it is not on the border of the "
+            f"cloud ({int(lacking.sum())} such points); mark it in `boundary` or give conormals"
+        )
+    assert border is not None
+    return border.conormals(cloud)[place[rows]]
+
+
+def _free_neighbors(cloud, rows, free, neighbors, method) -> Neighbors:
+    """Every row's own point, then free ones by distance; padding repeats a free one."""
+    need = method.basis_size(cloud.dim, Gradient())
+    radius = None
+    if neighbors is None:
+        if not is_concrete(cloud.points, cloud.normals):
+            raise ValueError("neighbors=None needs concrete arrays; under jit pass the neighbours")
+        indices, mask = _nearest_free(cloud, rows, free, method.neighbor_count(cloud.dim))
+    else:
+        if not is_concrete(neighbors.indices, neighbors.mask):
+            raise ValueError("neighbours must be concrete: which points are free decides shapes")
+        indices, mask = (np.asarray(x)[rows] for x in (neighbors.indices, neighbors.mask))
+        indices, mask = _compacted(indices, mask & (free[indices] | (indices == rows[:, None])))
+        if neighbors.radius is not None:
+            radius = jnp.broadcast_to(neighbors.radius, cloud.n)
+    count = mask.sum(axis=1)
+    if count.min() < need:
+        i = int(np.argmin(count))
+        raise ValueError(
+            f"point {rows[i]} has {count[i] - 1} free neighbours, {method} needs at least "
+            f"{need - 1} besides the point itself ({int(np.sum(count < need))} such points)"
+        )
+    indices = np.where(mask, indices, indices[:, 1:2])
+    return Neighbors(jnp.asarray(indices), jnp.asarray(mask), radius)
+
+
+def _nearest_free(cloud, rows, free, k):
+    """The k nearest of own point and free points, from as many candidates as it takes."""
+    available = cloud.n if cloud.active is None else int(np.asarray(cloud.active).sum())
+    count = min(2 * k, available)
+    while True:
+        indices, mask = nearest_of(cloud, rows, count)
+        mask = mask & (free[indices] | (indices == rows[:, None]))
+        if count == available or mask.sum(axis=1).min() >= k or count >= 8 * k:
+            return _compacted(indices, mask, k)
+        count = min(2 * count, available)
+
+
+def _compacted(indices, mask, k=None):
+    """The slots in use first, in their order; of these the first k."""
+    order = np.argsort(~mask, axis=1, kind="stable")
+    width = int(mask.sum(axis=1).max()) if k is None else min(k, int(mask.sum(axis=1).max()))
+    order = order[:, :width]
+    return np.take_along_axis(indices, order, axis=1), np.take_along_axis(mask, order, axis=1)
+
+
+def _check_stencils(rows, near, residual, method, dim) -> None:
+    residual = np.asarray(residual)
+    bad = np.flatnonzero(~(residual < float(np.finfo(residual.dtype).eps) ** 0.5))
+    if bad.size:
+        i = bad[0]
+        raise ValueError(
+            f"degenerate one-sided stencil at point {rows[i]}: relative moment residual "
+            f"{residual[i]:.1e} with {int(near.mask[i].sum()) - 1} free neighbours, {method} needs "
+            f"{method.basis_size(dim, Gradient()) - 1} in general position ({bad.size} such points)"
+        )
+
+
+def _check_pivots(rows, pivot, size) -> None:
+    bad = np.flatnonzero(~(np.abs(pivot) > _PIVOT * size))
+    if bad.size:
+        i = bad[0]
+        raise ValueError(
+            f"the condition does not determine the value at point {rows[i]}: a + b w_i = "
+            f"{pivot[i]:.1e}, |a| + |b| sum |w_j| = {size[i]:.1e} ({bad.size} such points)"
+        )

@@ -59,6 +59,8 @@ from .shapes.meshes import sample_mesh as sample_mesh
 from .shapes.order import sort_cloud as sort_cloud
 from .shapes.sampling import jitter as jitter
 from .shapes.sampling import poisson_disk as poisson_disk
+from .solve.eigen import Eigenmodes as Eigenmodes
+from .solve.eigen import eigenmodes as eigenmodes
 from .spectrum import Spectrum as Spectrum
 from .spectrum import spectral_estimate as spectral_estimate
 from .stencils.dcpse import DCPSE as DCPSE

@@ -116,7 +116,7 @@ class _System(eqx.Module):
     def to_scipy(self):
         """The matrix of the free points, and which they are."""
         free = np.flatnonzero(np.asarray(self.free))
-        return -self.operator.to_scipy()[free][:, free], free
+        return -self.operator.to_scipy().astype(float)[free][:, free], free
 
 
 # --- the rule -------------------------------------------------------------------------------
@@ -157,7 +157,9 @@ def _subspace(system: _System, k: int, degenerate: float, *, left: bool) -> Subs
 
     def compute(system, reference):
         matrix, free = system.to_scipy()
-        space = invariant.subspace(matrix, reference[free], k, degenerate, left=left)
+        space = invariant.subspace(
+            matrix, reference[free].astype(float), k, degenerate, left=left
+        )
         return _spread(space, free, n, reference.dtype)
 
     real, whole = reference.dtype, jnp.result_type(int)
@@ -177,14 +179,16 @@ def _subspace(system: _System, k: int, degenerate: float, *, left: bool) -> Subs
 
 
 def _reference(system: _System, k: int) -> Float[Array, "n K"]:
-    """Noise that fixes the basis of every group, for the modes asked for and some more.
+    """Noise around one that fixes the basis of every group (modes of one sign are positive).
 
-    The others end the last group, and with them out of the way derivatives converge fast.
+    For the modes asked for and some more: those end the last group, and with them out of the
+    way derivatives converge fast.
     """
     n = system.operator.n
     kinds = [a.dtype for a in jax.tree.leaves(eqx.filter(system, eqx.is_inexact_array))]
     count = min(k + 8 + 2 * math.isqrt(k), n)
-    return jax.random.normal(jax.random.key(0), (n, count), jnp.result_type(*kinds))
+    column = lambda j: jax.random.normal(jax.random.key(j), (n,), jnp.result_type(*kinds))
+    return 1 + jax.vmap(column)(jnp.arange(count)).T
 
 
 def _results(system: _System, space: Subspace, k: int):

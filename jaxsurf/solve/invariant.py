@@ -65,6 +65,9 @@ def subspace(
         left: whether left vectors are needed.
     """
     n, count = reference.shape
+    if not np.isfinite(matrix.data).all():
+        row = int(np.argmax(np.bincount(matrix.tocoo().row, ~np.isfinite(matrix.data)) > 0))
+        raise ValueError(f"row {row} of the operator is not finite")
     inverse = Inverse(matrix, shift=-_scale(matrix))
     eigenvalues, vectors = _lowest(matrix, count, inverse)
     groups = _groups(eigenvalues, degenerate, inverse.shift)

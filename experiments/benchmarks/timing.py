@@ -23,16 +23,22 @@ def first_and_median(call: Callable, repeats: int = 7) -> tuple[float, float]:
     return first, statistics.median(seconds)
 
 
-def side_by_side(ours: Callable, theirs: Callable, repeats: int = 7) -> tuple[float, float, float]:
-    """Medians of two calls in turn, and the median of their ratios pair by pair."""
+def side_by_side(
+    ours: Callable, theirs: Callable, repeats: int = 7, calls: int = 1
+) -> tuple[float, float, float]:
+    """Medians of two calls in turn, and the median of their ratios pair by pair.
+
+    Each measurement is the mean of a number of calls in a row, as an integrator would make them.
+    """
     jax.block_until_ready((ours(), theirs()))
     pairs = []
     for _ in range(repeats):
         pair = []
         for call in (ours, theirs):
             start = time.perf_counter()
-            jax.block_until_ready(call())
-            pair.append(time.perf_counter() - start)
+            for _ in range(calls):
+                jax.block_until_ready(call())
+            pair.append((time.perf_counter() - start) / calls)
         pairs.append(pair)
     a, b = zip(*pairs)
     ratios = [x / y for x, y in pairs]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import functools
 import math
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import scipy.sparse
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from .method import Diagnostics
@@ -103,20 +105,7 @@ class Stencil(AbstractOperator):
         batch = u.shape[1:split]
         # A single column is gathered alone; of several, whole rows.
         values = u if u.ndim == 1 else u.reshape(self.n, -1, *self.in_shape)
-
-        def term(w, neighbor):
-            """One slot's part, `(*out_shape, n, *batch)`."""
-            if not self.in_shape:
-                return w * neighbor if u.ndim == 1 else w[..., None] * neighbor
-            return sum(w[..., i, :, None] * neighbor[..., i] for i in range(self.in_shape[0]))
-
-        def add_slot(total, slot):
-            w, j = slot
-            return total + term(w, values.at[j].get(mode="promise_in_bounds")), None
-
-        shape = (*self.out_shape, *values.shape[: values.ndim - len(self.in_shape)])
-        zero = jnp.zeros(shape, jnp.result_type(u, self.weights))
-        total, _ = jax.lax.scan(add_slot, zero, (self.weights, self.indices))
+        total = _sum_slots(self.weights, self.indices, values, len(self.in_shape))
         total = jnp.moveaxis(total, 0, -1) if self.out_shape else total
         return total.reshape(self.n, *batch, *self.out_shape)
 
@@ -228,6 +217,68 @@ class Composition(AbstractOperator):
 
     def to_scipy(self):
         return self.outer.to_scipy() @ self.inner.to_scipy()
+
+
+# Slots added up in one pass over the memory of the result.
+_GROUP = 10
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
+def _sum_slots(weights, indices, values, contracted: int):
+    """All slots' terms, `(*out_shape, n, *batch)`; the last `contracted` axes are summed over."""
+
+    def add(slot, total):
+        w, j = (jax.lax.dynamic_index_in_dim(a, slot, keepdims=False) for a in (weights, indices))
+        return total + _term(w, j, values, contracted)
+
+    def add_group(i, total):
+        for q in range(_GROUP):
+            total = add(i * _GROUP + q, total)
+        return total
+
+    groups, rest = divmod(len(indices), _GROUP)
+    total = jax.lax.fori_loop(0, groups, add_group, _zero(weights, values, contracted))
+    for slot in range(len(indices) - rest, len(indices)):
+        total = add(slot, total)
+    return total
+
+
+@functools.partial(_sum_slots.defjvp, symbolic_zeros=True)
+def _sum_slots_jvp(contracted, primals, tangents):
+    # Bilinear. The tangents are sums one slot at a time, because JAX transposes a scan over slots
+    # into one that writes each slot's part once.
+    weights, indices, values = primals
+    d_weights, _, d_values = tangents
+    out = _sum_slots(weights, indices, values, contracted)
+    pairs = [(d_weights, values), (weights, d_values)]
+    parts = [
+        _scan_slots(w, indices, u, contracted)
+        for w, u in pairs
+        if not any(isinstance(a, SymbolicZero) for a in (w, u))
+    ]
+    return out, sum(parts, jnp.zeros_like(out))
+
+
+def _scan_slots(weights, indices, values, contracted: int):
+    def add_slot(total, slot):
+        return total + _term(*slot, values, contracted), None
+
+    zero = _zero(weights, values, contracted)
+    return jax.lax.scan(add_slot, zero, (weights, indices))[0]
+
+
+def _term(w, j, values, contracted: int):
+    """One slot's part: weights `(*out_shape, *in_shape, n)` times the neighbours' values."""
+    neighbor = values.at[j].get(mode="promise_in_bounds")
+    if contracted:
+        return sum(w[..., i, :, None] * neighbor[..., i] for i in range(values.shape[-1]))
+    return w * neighbor if values.ndim == 1 else w[..., None] * neighbor
+
+
+def _zero(weights, values, contracted: int):
+    out_shape = weights.shape[1 : weights.ndim - 1 - contracted]
+    shape = (*out_shape, *values.shape[: values.ndim - contracted])
+    return jnp.zeros(shape, jnp.result_type(weights, values))
 
 
 def _incoming(indices: np.ndarray):

@@ -26,6 +26,7 @@ from .frames import estimate_normals as estimate_normals
 from .frames import from_points as from_points
 from .frames import refit_normals as refit_normals
 from .frames import tangent_frames as tangent_frames
+from .ghosts import with_ghosts as with_ghosts
 from .io import read as read
 from .io import read_fields as read_fields
 from .io import write as write

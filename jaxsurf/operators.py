@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .cloud import PointCloud, is_concrete
 from .neighbors import Neighbors, find_neighbors, nearest_of
@@ -294,7 +294,11 @@ _GROWTH = (1.5, 2.25, 3.4)
 
 
 def choose_neighbors(
-    cloud: PointCloud, *, method: AbstractMethod = DCPSE(order=2), throw: bool = True
+    cloud: PointCloud,
+    *,
+    method: AbstractMethod = DCPSE(order=2),
+    bound: Bool[Array, " n"] | None = None,
+    throw: bool = True,
 ) -> Neighbors:
     r"""Neighbourhoods suited to a method, larger where the points are irregular.
 
@@ -302,17 +306,24 @@ def choose_neighbors(
     Laplacian's weight of the centre is then positive or small,
     $-w_{ii} < 0.2 \sum_{j \ne i} |w_{ij}|$, or its conditions cannot be met, the neighbourhood
     grows by half, up to three times. Such points are what gives collocation matrices
-    eigenvalues with positive real part (`experiments`, stability study).
+    eigenvalues with positive real part (`experiments`, stability study). On a border no
+    one-sided Laplacian has a dominant centre, however large: there neighbourhoods grow only
+    where the conditions cannot be met.
 
     Args:
         cloud: n points in d dimensions with unit normals; concrete.
         method: how the weights will be computed.
+        bound: True for points that need no stencil, `(n,)`, as a boundary condition gives their
+            values (`Closure.bound`); their rows are switched off and never grow.
         throw: passed on to `find_neighbors`.
 
     Returns:
         Neighbour lists; rows that did not grow are padded.
     """
-    return _adapted(cloud, method, throw)[0]
+    needed = np.ones(cloud.n, bool) if bound is None else ~np.asarray(bound)
+    neighbors = _adapted(cloud, method, throw, needed)[0]
+    mask = neighbors.mask & jnp.asarray(needed)[:, None]
+    return Neighbors(neighbors.indices, mask, neighbors.radius)
 
 
 def _build(cloud, neighbors, method, target, throw) -> Stencil:
@@ -349,7 +360,7 @@ def stencil_weights(cloud, neighbors, method, target, rows=None):
     return jnp.moveaxis(weights, (-1, 0), (0, -1)), diagnostics
 
 
-def _adapted(cloud, method, throw) -> tuple[Neighbors, tuple | None]:
+def _adapted(cloud, method, throw, needed=True) -> tuple[Neighbors, tuple | None]:
     """Neighbours that suit the method, and the Laplacian's weights unless some rows grew."""
     if not is_concrete(*jax.tree.leaves(cloud)):
         raise ValueError("neighbors=None needs concrete arrays; under jit pass the neighbours")
@@ -359,7 +370,8 @@ def _adapted(cloud, method, throw) -> tuple[Neighbors, tuple | None]:
     neighbors = find_neighbors(cloud, k, throw=throw)
     _check_sizes(cloud, neighbors, method, Laplacian(), throw)
     weights = stencil_weights(cloud, neighbors, method, Laplacian())
-    poor = np.flatnonzero(on & _is_poor(*weights))
+    border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
+    poor = np.flatnonzero(on & needed & _is_poor(*weights, border))
     widths = [min(int(k * growth), available) for growth in _GROWTH]
     if not poor.size or widths[-1] == k:
         return neighbors, weights
@@ -371,7 +383,8 @@ def _adapted(cloud, method, throw) -> tuple[Neighbors, tuple | None]:
     still = np.ones(rows.size, bool)
     for width in widths[:-1]:
         narrow = Neighbors(jnp.asarray(indices), jnp.asarray(mask & _first(width, mask)))
-        again = _is_poor(*stencil_weights(cloud, narrow, method, Laplacian(), jnp.asarray(rows)))
+        again = stencil_weights(cloud, narrow, method, Laplacian(), jnp.asarray(rows))
+        again = _is_poor(*again, border[rows])
         chosen = np.where(still & ~again, width, chosen)
         still &= again
     widest = chosen.max()
@@ -389,10 +402,11 @@ def _first(count, mask: np.ndarray) -> np.ndarray:
     return np.arange(mask.shape[1]) < count
 
 
-def _is_poor(weights, diagnostics) -> np.ndarray:
+def _is_poor(weights, diagnostics, border) -> np.ndarray:
     weights, residual = np.asarray(weights), np.asarray(diagnostics.residual)
     others = np.sum(np.abs(weights[1:]), axis=0)
-    return ~((-weights[0] >= _DOMINANCE * others) & (residual < _tolerance(weights.dtype)))
+    dominant = border | (-weights[0] >= _DOMINANCE * others)
+    return ~(dominant & (residual < _tolerance(weights.dtype)))
 
 
 # --- checks --------------------------------------------------------------------------------

@@ -1,0 +1,396 @@
+r"""Ghost points: the surface continued across its border by mirror images.
+
+A point at distance s inside the border has an image at distance s outside. The condition
+$a\,u + b\,\partial_\nu u = g$ at the foot between them, with the mean of both for u and their
+difference over 2 s for $\partial_\nu u$, gives the value of the image,
+
+$$u' = \frac{(b/2s - a/2)\,u + g}{b/2s + a/2}:$$
+
+even images for Neumann conditions, odd ones for Dirichlet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from .borders import Border, find_border
+from .boundary import Closure, Source
+from .cloud import PointCloud, is_concrete
+from .conditions import Condition, checked_conditions
+from .stencils.dcpse import DCPSE
+from .stencils.method import AbstractMethod
+
+# An image closer than this share of the spacing to another point is left out.
+_CLOSE = 0.5
+# a/2 + b/2s has to be more than this share of the sizes it is the sum of.
+_PIVOT = 1e-3
+
+
+def with_ghosts(
+    cloud: PointCloud,
+    conditions: Condition | Sequence[Condition],
+    *,
+    method: AbstractMethod = DCPSE(order=2),
+    depth: float | None = None,
+    border: Border | None = None,
+    throw: bool = True,
+) -> tuple[PointCloud, Closure]:
+    r"""A cloud continued across its border, with the values that the conditions give there.
+
+    Points near the border are reflected at the plane through their foot point on it and normal
+    to its conormal, normals along with them: planes, spheres and cylinders continue exactly,
+    any surface to second order. At a right-angled corner images are reflected again. Operators
+    on the enlarged cloud have full stencils up to the border. Border points under a Neumann or
+    Robin condition stay free, those under a Dirichlet condition are bound to its value.
+
+    Args:
+        cloud: n points with `boundary`, concrete.
+        conditions: as for `close`; points off the border take Dirichlet conditions only. Parts
+            of the border under no condition get no images.
+        method: of the operators to come: its neighbourhoods decide how deep the images reach.
+        depth: how deep, in the units of the points; by the method if None.
+        border: from `find_border`; found if None.
+        throw: check the factors of the images.
+
+    Returns:
+        The enlarged cloud, its first n points the old ones and the ghosts its new border, and
+        the closure for its fields (`Closure.extend` fills in a field of the n points).
+
+    Accuracy: images are off by O(h³) (Neumann, Robin with b ≠ 0) and O(h²) (Dirichlet), so that
+    solutions converge with second order whatever the method (`tests/test_boundary.py`); exact
+    to the method's order only where the solution itself has the symmetry.
+    Differentiable: in values, a and b; not in the points, whose images are found on the host.
+    Raises:
+        ValueError: as `close` and `find_border`; a Neumann or Robin condition off the border; no
+            border point under any condition; b/s + a near zero (a Robin condition of the wrong
+            sign), with the point.
+    Source: the method of images of Singh et al. 2023, Section 4.5.
+
+    Example:
+        >>> square = js.graph(lambda x, y: 0.0 * x, (11, 11))
+        >>> wide, closure = js.with_ghosts(square, js.neumann(square.boundary))
+        >>> x = wide.points[:, 0]
+        >>> even = closure.extend(square.points[:, 0] ** 2)
+        >>> bool(jnp.allclose(even, jnp.minimum(abs(x), 2 - abs(x)) ** 2))
+        True
+    """
+    if not is_concrete(cloud.points, cloud.normals, cloud.boundary, cloud.active):
+        raise ValueError("with_ghosts needs concrete points: images are found on the host")
+    conditions, owned = checked_conditions(cloud, conditions)
+    border = find_border(cloud) if border is None else border
+    owner, place = np.full(cloud.n, -1), np.zeros(cloud.n, int)
+    for number, (condition, own) in enumerate(zip(conditions, owned)):
+        owner[condition.where[own]], place[condition.where[own]] = number, np.flatnonzero(own)
+    _check_places(conditions, owned, border)
+
+    images = _reflected(cloud, border, owner, _reach(cloud, border, method, depth))
+    if not len(images.parent):
+        raise ValueError("no border point is under a condition: there is nothing to reflect")
+    images = images.only(_apart(cloud, images), cloud.n)
+    return _enlarged(cloud, images, conditions, owned, place, throw)
+
+
+@dataclass(frozen=True)
+class _Images:
+    """Images, those of images after their parents.
+
+    Args:
+        points, normals: `(m, d)`.
+        parent: the point that is reflected, n + j for image j, `(m,)`.
+        distance: from the parent to the foot, `(m,)`.
+        condition: number of the condition that holds at the foot, `(m,)`.
+        carriers: border points that carry its values to the foot, `(m, r)`.
+        shares: with which weight, `(m, r)`.
+    """
+
+    points: Float[np.ndarray, "m d"]
+    normals: Float[np.ndarray, "m d"]
+    parent: Int[np.ndarray, " m"]
+    distance: Float[np.ndarray, " m"]
+    condition: Int[np.ndarray, " m"]
+    carriers: Int[np.ndarray, "m r"]
+    shares: Float[np.ndarray, "m r"]
+
+    def only(self, kept, n) -> _Images:
+        """Some of them, parents renumbered."""
+        number = np.concatenate([np.arange(n), n + np.cumsum(kept) - 1])
+        fields = {name: value[kept] for name, value in vars(self).items()}
+        return _Images(**(fields | {"parent": number[fields["parent"]]}))
+
+    def ancestors(self, n):
+        """Which are images of images, of which one, and the point that all began with."""
+        second = self.parent >= n
+        parent = np.where(second, self.parent - n, 0)
+        return second, parent, np.where(second, self.parent[parent], self.parent)
+
+    @classmethod
+    def joined(cls, parts: list[_Images]) -> _Images:
+        columns = zip(*(vars(part).values() for part in parts))
+        return cls(*(np.concatenate(column) for column in columns))
+
+
+def _check_places(conditions, owned, border) -> None:
+    on_border = np.asarray(border.points)
+    for number, (condition, own) in enumerate(zip(conditions, owned)):
+        off = np.setdiff1d(condition.where[own], on_border)
+        if condition.b is not None and off.size:
+            raise ValueError(
+                f"condition {number} takes a derivative at point {off[0]}, which is not on the "
+                f"border ({off.size} such points): images need a border"
+            )
+
+
+def _reach(cloud, border, method, depth) -> Float[np.ndarray, " m"]:
+    """How deep images reach, for every border point: as far as half its neighbours."""
+    m = len(border.points)
+    if depth is not None:
+        if not depth > 0:
+            raise ValueError(f"depth = {depth}, expected a positive length")
+        return np.full(m, float(depth))
+    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    points = np.asarray(cloud.points, float)
+    half = method.neighbor_count(cloud.dim) / 2
+    count = np.where(np.asarray(border.corners), half / 2, half).astype(int) + 1
+    most = min(int(count.max()), int(on.sum()))
+    distance = cKDTree(points[on]).query(points[np.asarray(border.points)], most)[0]
+    return distance[np.arange(m), np.minimum(count, most) - 1]
+
+
+# --- where images are ----------------------------------------------------------------------
+
+
+def _reflected(cloud, border, owner, reach) -> _Images:
+    """Images across every piece of the border, and next to corners images of images."""
+    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    names = np.flatnonzero(on)
+    points, normals = np.asarray(cloud.points)[names], np.asarray(cloud.normals)[names]
+    pieces = _pieces(border)
+    across = _Across(cloud, border, owner, reach)
+    first = [across.reflect(piece, names, points, normals) for piece in pieces]
+    start = cloud.n + np.cumsum([0, *(len(images.parent) for images in first)])
+    again = []
+    # Either order leads to the same place at a right angle; one is enough.
+    for i, images in enumerate(first):
+        for j in range(i + 1, len(pieces)):
+            common = np.intersect1d(pieces[i], pieces[j])
+            if common.size:
+                own = start[i] + np.arange(len(images.parent))
+                args = (pieces[j], own, images.points, images.normals)
+                again.append(across.reflect(*args, corners=common))
+    return _Images.joined([*first, *again])
+
+
+@dataclass(frozen=True)
+class _Across:
+    """Reflection across the pieces of a border.
+
+    Args:
+        cloud, border: the surface.
+        owner: number of the condition at each point, −1 for none, `(n,)`.
+        reach: how deep images go, for each border point.
+    """
+
+    cloud: PointCloud
+    border: Border
+    owner: Int[np.ndarray, " n"]
+    reach: Float[np.ndarray, " m"]
+
+    def reflect(self, piece, names, points, normals, *, corners=None) -> _Images:
+        """Images of some points across one piece; with `corners`, of those beyond its ends."""
+        spots = np.asarray(self.border.points)
+        all_points = np.asarray(self.cloud.points)
+        distance, nearest = cKDTree(all_points[spots[piece]]).query(points)
+        slot = piece[nearest]
+        near = (distance < self.reach[slot]) & ~np.isin(names, spots[piece])
+        near &= self.owner[spots[slot]] >= 0
+        if corners is not None:
+            near &= np.isin(slot, corners)
+        names, points, normals, slot = names[near], points[near], normals[near], slot[near]
+        side = _sides(self.border, piece, slot)
+        found = self.border.at(self.cloud, side, slot, jnp.asarray(points))
+        foot, _, conormal, share = (np.asarray(x) for x in found)
+        inside = -np.einsum("pd,pd->p", points - foot, conormal)
+
+        row, used = (np.asarray(x)[side, slot] for x in (self.border.rows, self.border.mask))
+        end = all_points[spots[slot]]
+        beside = used & (row != spots[slot][:, None])
+        inner = all_points[row[np.arange(len(row)), np.argmax(beside, axis=1)]]
+        is_end = np.asarray(self.border.corners)[slot]
+        beyond = is_end & (np.einsum("pd,pd->p", foot - end, end - inner) > 1e-9 * distance[near])
+        keep = inside > 1e-3 * distance[near]
+        keep &= ~beyond if corners is None else beyond
+
+        condition = self.owner[spots[slot]]
+        shared = np.all(~used | (self.owner[row] == condition[:, None]), axis=1) & ~beyond
+        alone = np.arange(row.shape[1]) == 0
+        carriers = np.where(shared[:, None], row, spots[slot][:, None])
+        shares = np.where(shared[:, None], share, alone)
+        step = 2 * inside[:, None] * conormal
+        turned = normals - 2 * np.einsum("pd,pd->p", normals, conormal)[:, None] * conormal
+        images = (points + step, turned, names, inside, condition, carriers, shares)
+        return _Images(*(x[keep] for x in images))
+
+
+def _pieces(border: Border) -> list[Int[np.ndarray, " p"]]:
+    """Places in `border.points` of every smooth piece, the corners at its ends included."""
+    spots, rows = np.asarray(border.points), np.asarray(border.rows)
+    place = np.full(int(spots.max(initial=0)) + int(rows.max(initial=0)) + 1, -1)
+    place[spots] = np.arange(len(spots))
+    corner = np.asarray(border.corners)
+    near = place[rows[0]] if rows.shape[2] > 2 else np.arange(len(spots))[:, None]
+    i = np.broadcast_to(np.arange(len(spots))[:, None], near.shape)
+    inner = ~corner[i] & ~corner[near]
+    graph = coo_array((np.ones(inner.sum()), (i[inner], near[inner])), shape=(len(spots),) * 2)
+    label = connected_components(graph, directed=False)[1]
+    pieces = []
+    for number in np.unique(label[~corner]):
+        members = np.flatnonzero(~corner & (label == number))
+        pieces.append(np.unique(np.concatenate([members, near[members].ravel()])))
+    return pieces
+
+
+def _sides(border: Border, piece, slot) -> Int[np.ndarray, " p"]:
+    """On which side of each slot the piece lies; it matters at corners only."""
+    rows, spots = np.asarray(border.rows), np.asarray(border.points)
+    inner = spots[piece[~np.asarray(border.corners)[piece]]]
+    return np.where(np.isin(rows[0, slot], inner).any(axis=1), 0, 1)
+
+
+def _apart(cloud, images) -> Bool[np.ndarray, " m"]:
+    """Images that are not too close to points, or to images before them."""
+    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    points = np.asarray(cloud.points, float)[on]
+    tree = cKDTree(points)
+    distance, nearest = tree.query(images.points)
+    spacing = tree.query(points[nearest], 2)[0][:, 1]
+    kept = distance > _CLOSE * spacing
+    pairs = cKDTree(images.points).query_pairs(_CLOSE * float(spacing.max()), output_type="ndarray")
+    gap = np.linalg.norm(images.points[pairs[:, 0]] - images.points[pairs[:, 1]], axis=1)
+    for i, j in pairs[gap < _CLOSE * spacing[pairs[:, 0]]].tolist():
+        kept[max(i, j)] &= not kept[min(i, j)]
+    second = images.parent >= cloud.n
+    kept[second] &= kept[images.parent[second] - cloud.n]
+    return kept
+
+
+# --- their values --------------------------------------------------------------------------
+
+
+def _enlarged(cloud, images, conditions, owned, place, throw) -> tuple[PointCloud, Closure]:
+    n, m, dtype = cloud.n, len(images.parent), cloud.points.dtype
+    second, parent, root = images.ancestors(n)
+
+    # u' = weight u + g / plus, with the conditions carried to the feet.
+    weight, inverse = jnp.zeros(m, dtype), jnp.zeros(m, dtype)
+    for number, condition in enumerate(conditions):
+        here = np.flatnonzero(images.condition == number)
+        pick, share = place[images.carriers[here]], images.shares[here]
+        a = _carried(condition.a, condition.m, pick, share).astype(dtype) / 2
+        b = 0 * a
+        if condition.b is not None:
+            b = _carried(condition.b, condition.m, pick, share) / (2 * images.distance[here])
+        if throw and is_concrete(a, b):
+            _check_factor(np.asarray(a + b), np.asarray(abs(a) + abs(b)), root[here])
+        weight = weight.at[here].set((b - a) / (a + b))
+        inverse = inverse.at[here].set(1 / (a + b))
+    total = jnp.where(second, weight * weight[parent], weight)
+
+    fixed = [c.where[own] if c.b is None else c.where[:0] for c, own in zip(conditions, owned)]
+    rows = np.concatenate([*fixed, n + np.arange(m)])
+    first = len(rows) - m
+    bound = np.full(n, -1)
+    sources, start = [], 0
+    for number, (condition, points) in enumerate(zip(conditions, fixed)):
+        entries = _Entries(dtype)
+        if len(points):
+            a = jnp.broadcast_to(condition.a, condition.m)[place[points]]
+            entries.add(start + np.arange(len(points)), 1 / a, place[points])
+            bound[points] = number
+            start += len(points)
+        here = np.flatnonzero(images.condition == number)
+        entries.add_carried(images, place, first + here, inverse[here], here)
+        child = np.flatnonzero(second & (images.condition[parent] == number))
+        above = parent[child]
+        entries.add_carried(images, place, first + child, weight[child] * inverse[above], above)
+        sources.append(entries)
+    # Images of points of known value.
+    for number, condition in enumerate(conditions):
+        here = np.flatnonzero(bound[root] == number)
+        if here.size:
+            a = jnp.broadcast_to(condition.a, condition.m)[place[root[here]]]
+            sources[number].add(first + here, total[here] / a, place[root[here]])
+    free = int(np.argmax(np.bincount(np.flatnonzero(bound < 0), minlength=n)))
+    depends = np.where(bound[root] < 0, root, free)
+    total = jnp.where(bound[root] < 0, total, 0)
+
+    indices = jnp.asarray(np.concatenate([np.full(first, free), depends]).astype(np.int32))
+    weights = jnp.concatenate([jnp.zeros(first, dtype), total])
+    closure = Closure(
+        n + m,
+        jnp.asarray(rows.astype(np.int32)),
+        indices[None],
+        weights[None],
+        tuple(entries.source(c) for entries, c in zip(sources, conditions) if entries.slots),
+    )
+    return _joined(cloud, images), closure
+
+
+def _carried(x, m: int, pick, share) -> Float[Array, " p"]:
+    return jnp.sum(share * jnp.broadcast_to(x, m)[pick], axis=1)
+
+
+class _Entries:
+    """The places where the values of one condition enter."""
+
+    def __init__(self, dtype):
+        self.dtype = dtype
+        self.slots: list[np.ndarray] = []
+        self.factors: list[Array] = []
+        self.picks: list[np.ndarray] = []
+
+    def add(self, slots, factors, picks):
+        self.slots.append(np.asarray(slots))
+        self.factors.append(jnp.asarray(factors, self.dtype))
+        self.picks.append(np.asarray(picks))
+
+    def add_carried(self, images, place, slots, factors, which):
+        """Values carried to the feet of some images."""
+        share = images.shares[which]
+        i, r = np.nonzero(share)
+        self.add(slots[i], factors[i] * share[i, r], place[images.carriers[which][i, r]])
+
+    def source(self, condition) -> Source:
+        slots, picks = (jnp.asarray(np.concatenate(x)) for x in (self.slots, self.picks))
+        return Source(slots, jnp.concatenate(self.factors), picks, condition)
+
+
+def _joined(cloud, images) -> PointCloud:
+    m = len(images.parent)
+    pad = lambda x, value: None if x is None else jnp.concatenate([x, jnp.full(m, value, x.dtype)])
+    root = images.ancestors(cloud.n)[2]
+    spacing = cloud.spacing
+    return PointCloud(
+        jnp.concatenate([cloud.points, jnp.asarray(images.points, cloud.points.dtype)]),
+        jnp.concatenate([cloud.normals, jnp.asarray(images.normals, cloud.points.dtype)]),
+        boundary=jnp.arange(cloud.n + m) >= cloud.n,
+        active=pad(cloud.active, True),
+        spacing=None if spacing is None else jnp.concatenate([spacing, spacing[root]]),
+    )
+
+
+def _check_factor(factor, size, root) -> None:
+    bad = np.flatnonzero(~(np.abs(factor) > _PIVOT * size))
+    if bad.size:
+        i = bad[0]
+        raise ValueError(
+            f"the condition does not determine the image of point {root[i]}: a/2 + b/2s = "
+            f"{factor[i]:.1e}, |a|/2 + |b|/2s = {size[i]:.1e} ({bad.size} such points)"
+        )

@@ -62,6 +62,13 @@ from .shapes.sampling import jitter as jitter
 from .shapes.sampling import poisson_disk as poisson_disk
 from .solve.eigen import Eigenmodes as Eigenmodes
 from .solve.eigen import eigenmodes as eigenmodes
+from .solve.krylov import BiCGStab as BiCGStab
+from .solve.precondition import AbstractPreconditioner as AbstractPreconditioner
+from .solve.precondition import Jacobi as Jacobi
+from .solve.precondition import Multigrid as Multigrid
+from .solve.precondition import jacobi as jacobi
+from .solve.precondition import multigrid as multigrid
+from .solve.steady import solve as solve
 from .spectrum import Spectrum as Spectrum
 from .spectrum import spectral_estimate as spectral_estimate
 from .stencils.dcpse import DCPSE as DCPSE

@@ -1,0 +1,190 @@
+"""Sparse matrices as padded arrays, slots first, with gathers in both directions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+from jaxtyping import Array, Float, Int
+
+from ..stencils.stencil import AbstractOperator, Composition, Stencil
+
+# An entry added by a scatter costs about as much as this many padded slots.
+_SCATTER = 12
+# Below this many entries one gather of everything is faster than a loop over slots.
+_SMALL = 50_000
+
+
+class Table(NamedTuple):
+    """Where the entries of a sparse matrix go: row by row in slots, what sticks out in a list.
+
+    Args:
+        columns: column of row i in slot s, `(k, m)`; padding refers to column 0.
+        source: number of the entry, `(k, m)`; in padding a number past the end.
+        rows, others, sources: row, column and number of the entries beyond the k-th of their row.
+    """
+
+    columns: np.ndarray
+    source: np.ndarray
+    rows: np.ndarray
+    others: np.ndarray
+    sources: np.ndarray
+
+
+def tabulate(indptr: np.ndarray, columns: np.ndarray, source: np.ndarray | None = None) -> Table:
+    """Slots for the rows of a matrix in compressed form; k is chosen by the cost of applying."""
+    start, length = indptr[:-1].astype(np.int32), np.diff(indptr).astype(np.int32)
+    m, count = len(length), len(columns)
+    widest = int(length.max(initial=0))
+    # Number of entries beyond the k-th of their row, for every k.
+    longer = m - np.cumsum(np.bincount(length, minlength=widest + 1))
+    overflow = np.append(np.cumsum(longer[::-1])[::-1], 0)[: widest + 1]
+    k = int(np.argmin(np.arange(widest + 1) * m + _SCATTER * overflow))
+    table, numbers = np.zeros((k, m), np.int32), np.full((k, m), count, np.int32)
+    for slot in range(k):
+        place = start + np.int32(slot)
+        rows = slice(None) if slot < length.min() else np.flatnonzero(length > slot)
+        table[slot, rows] = columns[place[rows]]
+        numbers[slot, rows] = place[rows]
+    long = np.flatnonzero(length > k)
+    beyond = length[long] - k
+    rows = np.repeat(long, beyond).astype(np.int32)
+    step = np.arange(beyond.sum()) - np.repeat(np.cumsum(beyond) - beyond, beyond)
+    place = (start[rows] + k + step).astype(np.int32)
+    others = columns[place].astype(np.int32)
+    if source is not None:
+        source = np.append(source, np.iinfo(np.int32).max).astype(np.int32)
+        numbers, place = source[numbers], source[place]
+    return Table(table, numbers, rows, others, place)
+
+
+class PaddedMatrix(eqx.Module):
+    """A sparse, possibly rectangular matrix that is applied with one gather per slot.
+
+    Args:
+        indices: columns, `(k, m)`.
+        weights: entries, `(k, m)`; zero in padded slots.
+        diagonal: added to the diagonal, `(m,)`; None for zero.
+        extra: rows, columns and values of entries that did not fit.
+    """
+
+    indices: Int[Array, "k m"]
+    weights: Float[Array, "k m"]
+    diagonal: Float[Array, " m"] | None
+    extra: tuple[Int[Array, " e"], Int[Array, " e"], Float[Array, " e"]]
+
+    @classmethod
+    def from_scipy(cls, matrix: scipy.sparse.csr_matrix, dtype) -> PaddedMatrix:
+        table = tabulate(matrix.indptr, matrix.indices)
+        return cls.gathered(table, np.append(matrix.data.astype(dtype), np.zeros(1, dtype)))
+
+    @classmethod
+    def gathered(cls, table: Table, values, diagonal=None) -> PaddedMatrix:
+        """With the entries taken from an array whose last value is zero."""
+        extra = (
+            jnp.asarray(table.rows),
+            jnp.asarray(table.others),
+            jnp.asarray(values[table.sources]),
+        )
+        weights = jnp.asarray(values[table.source])
+        return cls(jnp.asarray(table.columns), weights, diagonal, extra)
+
+    def __call__(self, x: Float[Array, " p"]) -> Float[Array, " m"]:
+        k, m = self.indices.shape
+        take = lambda j: x.at[j].get(mode="promise_in_bounds")
+        zero = jnp.zeros(m, jnp.result_type(x, self.weights))
+        start = zero if self.diagonal is None else self.diagonal * x
+        if k * m < _SMALL:
+            total = start + jnp.sum(self.weights * take(self.indices), axis=0)
+        else:
+            add = lambda total, slot: (total + slot[0] * take(slot[1]), None)
+            total = jax.lax.scan(add, start, (self.weights, self.indices))[0]
+        rows, columns, values = self.extra
+        if rows.size:
+            total = total.at[rows].add(values * take(columns))
+        return total
+
+
+class Incoming(eqx.Module):
+    """Which entries of a stencil refer to each point: its transpose without a scatter.
+
+    Args:
+        indices: of the stencil that the layout belongs to, `(k, n)`.
+        table: entries by the point they read; those on the diagonal left out.
+    """
+
+    indices: Int[Array, "k n"]
+    table: Table
+
+    @classmethod
+    def of(cls, stencil: Stencil) -> Incoming | None:
+        """The layout of a scalar stencil with concrete indices; None of one with components."""
+        if stencil.in_shape or stencil.out_shape:
+            return None
+        k, n = stencil.indices.shape
+        target = np.ascontiguousarray(np.asarray(stencil.indices).T, dtype=np.int32)
+        number = np.arange(n, dtype=np.int32)[:, None] + np.arange(k, dtype=np.int32) * np.int32(n)
+        # Padded slots refer to their own row: left in, they would make long rows.
+        other = target != np.arange(n, dtype=np.int32)[:, None]
+        indptr = np.append(0, np.cumsum(other.sum(axis=1)))
+        matrix = scipy.sparse.csr_matrix((number[other], target[other], indptr), shape=(n, n))
+        turned = matrix.tocsc()
+        table = tabulate(turned.indptr, turned.indices, turned.data)
+        return cls(stencil.indices, Table(*(jnp.asarray(a) for a in table)))
+
+    def transpose(self, stencil: Stencil) -> PaddedMatrix:
+        """The transposed stencil, with its weights gathered once.
+
+        The stencil must have the indices that the layout was made for.
+        """
+        weights = stencil.weights
+        if stencil.indices is not self.indices:
+            weights = eqx.error_if(
+                weights,
+                jnp.any(stencil.indices != self.indices),
+                "the preconditioner was made for other neighbours than the operator has: make it "
+                "for this operator",
+            )
+        k, n = stencil.indices.shape
+        own = stencil.indices == jnp.arange(n, dtype=stencil.indices.dtype)
+        diagonal = jnp.sum(jnp.where(own, weights, 0), axis=0)
+        values = weights.reshape(-1)
+        fill = lambda place: values.at[place].get(mode="fill", fill_value=0)
+        table = self.table
+        extra = (table.rows, table.others, fill(table.sources))
+        return PaddedMatrix(table.columns, fill(table.source), diagonal, extra)
+
+
+# Of a stencil; of the factors of a composition; None where it is not known.
+Layout = Incoming | tuple | None
+
+
+def incoming_layout(operator: AbstractOperator) -> Layout:
+    """The layout of the transpose of an operator with concrete indices."""
+    if isinstance(operator, Composition):
+        return incoming_layout(operator.outer), incoming_layout(operator.inner)
+    return Incoming.of(operator) if isinstance(operator, Stencil) else None
+
+
+def adjoint(operator: AbstractOperator, layout: Layout) -> Callable | None:
+    """The transposed operator by gathers; None where a layout is lacking."""
+    if isinstance(operator, Composition) and isinstance(layout, tuple):
+        outer, inner = adjoint(operator.outer, layout[0]), adjoint(operator.inner, layout[1])
+        return None if outer is None or inner is None else _Chain(outer, inner)
+    if isinstance(operator, Stencil) and isinstance(layout, Incoming):
+        if operator.indices.shape == layout.indices.shape:
+            return layout.transpose(operator)
+    return None
+
+
+class _Chain(eqx.Module):
+    first: Callable
+    second: Callable
+
+    def __call__(self, v):
+        return self.second(self.first(v))

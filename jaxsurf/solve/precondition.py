@@ -1,0 +1,313 @@
+r"""Preconditioners: algebraic multigrid set up on the host, its cycle in JAX; and Jacobi's."""
+
+from __future__ import annotations
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+from jaxtyping import Array, Float
+
+from ..boundary import Closure
+from ..cloud import is_concrete
+from ..stencils.stencil import AbstractOperator, Composition, Stencil
+from .padded import Layout, PaddedMatrix, incoming_layout
+from .reduced import annihilates_constants, check_scalar, reduced_matrix
+
+# The coarsest system has at most this many unknowns and is solved by a dense inverse.
+_COARSEST = 400
+# A connection counts as strong from this share of the geometric mean of both diagonal entries.
+_STRENGTH = 0.05
+# The smoother damps the part of the spectrum from this share of its end upwards.
+_SMOOTHED = 0.25
+
+
+class AbstractPreconditioner(eqx.Module):
+    """A cheap approximation of the inverse of an operator.
+
+    Args:
+        incoming: layout of the operator's transpose, for adjoint solves; None if unknown.
+        mean_zero: the operator annihilates the constants; None if unknown.
+    """
+
+    incoming: Layout
+    mean_zero: bool | None = eqx.field(static=True)
+
+    @abc.abstractmethod
+    def __call__(self, r: Float[Array, " n"]) -> Float[Array, " n"]:
+        """An approximate solution u of A u = r; linear in r."""
+
+    @abc.abstractmethod
+    def transpose(self) -> AbstractPreconditioner:
+        """The exact transpose, which serves the transposed operator."""
+
+
+class Jacobi(AbstractPreconditioner):
+    """Division by the diagonal. Needs no set-up, and works on traced operators.
+
+    Args:
+        diagonal: of the operator, `(n,)`.
+    """
+
+    diagonal: Float[Array, " n"]
+
+    def __call__(self, r):
+        return r / self.diagonal
+
+    def transpose(self):
+        return self
+
+
+class Level(eqx.Module):
+    """One level of a multigrid hierarchy.
+
+    Args:
+        matrix: the operator on this level.
+        turned: its transpose.
+        inverse: of the diagonal.
+        restrict: to the next coarser level.
+        prolong: from there.
+        damping: factors of the smoothing steps.
+    """
+
+    matrix: PaddedMatrix
+    turned: PaddedMatrix
+    inverse: Float[Array, " n"]
+    restrict: PaddedMatrix
+    prolong: PaddedMatrix
+    damping: tuple[Float[Array, ""], ...]
+
+    def smooth(self, x, b):
+        for factor in self.damping:
+            x = x + factor * self.inverse * (b - self.matrix(x))
+        return x
+
+    def presmooth(self, b):
+        """The smoother from zero."""
+        x = self.damping[0] * self.inverse * b
+        for factor in self.damping[1:]:
+            x = x + factor * self.inverse * (b - self.matrix(x))
+        return x
+
+
+class Multigrid(AbstractPreconditioner):
+    """A V-cycle of smoothed aggregation: made by `multigrid`.
+
+    Args:
+        levels: from fine to coarse.
+        coarsest: inverse of the coarsest operator.
+    """
+
+    levels: tuple[Level, ...]
+    coarsest: Float[Array, "m m"]
+
+    def __call__(self, r):
+        # The cycle is linear, so that a residual of any size can be brought to size one,
+        # where single precision is safe.
+        size = jnp.max(jnp.abs(r))
+        scale = jnp.where(size > 0, size, 1)
+        cycled = self._cycle(0, (r / scale).astype(self.coarsest.dtype))
+        return cycled.astype(r.dtype) * scale
+
+    def _cycle(self, depth, b):
+        if depth == len(self.levels):
+            return self.coarsest @ b
+        level = self.levels[depth]
+        x = level.presmooth(b)
+        x = x + level.prolong(self._cycle(depth + 1, level.restrict(b - level.matrix(x))))
+        return level.smooth(x, b)
+
+    def transpose(self):
+        # The prolongation is the transposed restriction: both stay. So do polynomials in
+        # D⁻¹A times D⁻¹, with A transposed.
+        levels = tuple(
+            Level(l.turned, l.matrix, l.inverse, l.restrict, l.prolong, l.damping[::-1])
+            for l in self.levels
+        )
+        return Multigrid(self.incoming, self.mean_zero, levels, self.coarsest.T)
+
+
+class _Product(AbstractPreconditioner):
+    """One preconditioner after another, for a composition of operators."""
+
+    outer: AbstractPreconditioner
+    inner: AbstractPreconditioner
+
+    @classmethod
+    def of(cls, outer, inner):
+        mean_zero = bool(outer.mean_zero or inner.mean_zero)
+        return cls((outer.incoming, inner.incoming), mean_zero, outer, inner)
+
+    def __call__(self, r):
+        return self.inner(self.outer(r))
+
+    def transpose(self):
+        return _Product.of(self.inner.transpose(), self.outer.transpose())
+
+
+def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> Jacobi:
+    r"""The diagonal of an operator as a preconditioner.
+
+    Needs no optional package and no concrete arrays, but takes of the order of $1/h$ steps:
+    for small systems, small time steps, and strongly screened problems.
+
+    Args:
+        operator: a stencil from scalar fields to scalar fields; may be traced.
+        conditions: from `js.close` or `js.with_ghosts`.
+
+    Returns:
+        To be passed to `js.solve`.
+
+    Raises:
+        ValueError: a composition of operators, or one with components.
+
+    Example:
+        >>> screened = js.laplace_beltrami(js.sphere(500)).scaled(-1.0).shifted(1.0)
+        >>> bool((js.jacobi(screened).diagonal > 0).all())
+        True
+    """
+    if not isinstance(operator, Stencil):
+        raise ValueError(f"the diagonal of a {type(operator).__name__} is not at hand")
+    check_scalar(operator)
+    own = operator.indices == jnp.arange(operator.n, dtype=operator.indices.dtype)
+    diagonal = jnp.sum(jnp.where(own, operator.weights, 0), axis=0)
+    if conditions is not None:
+        diagonal = jnp.where(conditions.bound, 1, diagonal)
+    incoming = incoming_layout(operator) if is_concrete(operator.indices) else None
+    return Jacobi(incoming, None, jax.lax.stop_gradient(diagonal))
+
+
+def multigrid(
+    operator: AbstractOperator,
+    *,
+    conditions: Closure | None = None,
+    single: bool = True,
+) -> AbstractPreconditioner:
+    r"""Smoothed-aggregation multigrid (Vaněk, Mandel and Brezina 1996) as a preconditioner.
+
+    Aggregates are found on the host by pyamg. The cycle, one V with Chebyshev smoothing and a
+    dense coarsest solve, is plain JAX on padded arrays: it runs under `jit` and `vmap`, and its
+    exact transpose serves adjoint solves. It is a constant for derivatives; a hierarchy made
+    for one operator serves nearby ones too (other weights on the same neighbours), at the
+    price of more steps.
+
+    Args:
+        operator: scalar, with concrete arrays. For an indefinite Helmholtz operator
+            $\Delta + \kappa^2$ pass $\Delta - \kappa^2$ here.
+        conditions: from `js.close` or `js.with_ghosts`; the same as for `js.solve`.
+        single: hold and run the cycle in single precision, which halves its time. The solution
+            is not affected: its residual is computed in the precision of the operator.
+
+    Returns:
+        To be passed to `js.solve`. A composition gets one hierarchy for each factor.
+
+    Raises:
+        ImportError: pyamg is not installed (extra `multigrid`).
+        ValueError: an operator that is traced, not finite, or has components or zero rows; a
+            part of the points that nothing ties to the rest and on which constants are
+            undetermined.
+
+    Example:
+        >>> laplacian = js.laplace_beltrami(js.sphere(2_000))
+        >>> len(js.multigrid(laplacian).levels)
+        1
+    """
+    if isinstance(operator, Composition) and conditions is None:
+        outer, inner = (multigrid(o, single=single) for o in (operator.outer, operator.inner))
+        return _Product.of(outer, inner)
+    check_scalar(operator)
+    matrix = reduced_matrix(operator, conditions)
+    mean_zero = annihilates_constants(matrix, conditions)
+    dtype = np.dtype(np.float32) if single else matrix.dtype
+    levels = []
+    constant = np.ones(matrix.shape[0])
+    if conditions is not None:
+        constant[np.asarray(conditions.rows)] = 0
+    fine = matrix
+    while fine.shape[0] > _COARSEST:
+        aggregated = _aggregated(fine, constant)
+        if aggregated is None:
+            break
+        level, fine, constant = _level(fine, *aggregated, dtype)
+        levels.append(level)
+    if fine.shape[0] > 4 * _COARSEST:
+        raise ValueError(
+            f"coarsening stopped at {fine.shape[0]} unknowns: too few strong connections"
+        )
+    coarsest = jnp.asarray(_inverse(fine, constant if mean_zero else None).astype(dtype))
+    return Multigrid(incoming_layout(operator), mean_zero, tuple(levels), coarsest)
+
+
+# --- set-up on the host --------------------------------------------------------------------
+
+
+def _aggregated(matrix, constant):
+    """Tentative prolongation and the coarse constants; None if nothing can be aggregated."""
+    try:
+        from pyamg.aggregation import fit_candidates, standard_aggregation
+        from pyamg.strength import symmetric_strength_of_connection
+    except ImportError as error:
+        raise ImportError(
+            "js.multigrid needs pyamg: pip install 'jaxsurf[multigrid]'. Without it pass "
+            "preconditioner=js.jacobi(operator), which takes more steps"
+        ) from error
+    strong = symmetric_strength_of_connection(matrix, theta=_STRENGTH)
+    aggregates = standard_aggregation(strong)[0]
+    if aggregates.shape[1] == 0 or aggregates.shape[1] > 0.8 * matrix.shape[0]:
+        return None
+    tentative, coarse = fit_candidates(aggregates, constant[:, None])
+    return scipy.sparse.csr_matrix(tentative), coarse[:, 0]
+
+
+def _level(matrix, tentative, coarse, dtype):
+    diagonal = matrix.diagonal()
+    if np.any(diagonal == 0):
+        i = int(np.flatnonzero(diagonal == 0)[0])
+        raise ValueError(f"the diagonal of the operator is zero in row {i}: nothing to smooth with")
+    inverse = 1 / diagonal
+    radius = _radius(matrix, inverse)
+    # (I - w D⁻¹ A) T
+    damped = matrix.copy()
+    damped.data *= np.repeat(-4 / 3 / radius * inverse, np.diff(matrix.indptr))
+    prolong = (tentative + damped @ tentative).tocsr()
+    restrict = prolong.T.tocsr()
+    pad = lambda a: PaddedMatrix.from_scipy(a, dtype)
+    level = Level(
+        pad(matrix),
+        pad(matrix.T.tocsr()),
+        jnp.asarray(inverse.astype(dtype)),
+        pad(restrict),
+        pad(prolong),
+        _chebyshev(radius, dtype),
+    )
+    return level, (restrict @ (matrix @ prolong)).tocsr(), coarse
+
+
+def _radius(matrix, inverse, steps: int = 8) -> float:
+    """Spectral radius of D⁻¹A by the power method; a few per cent too small."""
+    v = np.random.default_rng(0).normal(size=matrix.shape[0])
+    for _ in range(steps):
+        v = inverse * (matrix @ v)
+        size = np.sqrt(np.sum(v * v))
+        v /= size
+    return float(size)
+
+
+def _chebyshev(radius, dtype, degree: int = 2):
+    """Step sizes at the roots of the Chebyshev polynomial on the upper part of the spectrum."""
+    low, high = _SMOOTHED * radius, 1.1 * radius
+    roots = np.cos(np.pi * (np.arange(degree) + 0.5) / degree)
+    return tuple(jnp.asarray(x, dtype) for x in 1 / ((low + high) / 2 + (high - low) / 2 * roots))
+
+
+def _inverse(matrix, constant) -> np.ndarray:
+    """Dense inverse; on the complement of the constants where these are in the null space."""
+    dense = matrix.toarray()
+    if constant is None:
+        return np.linalg.inv(dense)
+    border = constant[:, None] * np.abs(dense).max() / np.linalg.norm(constant)
+    bordered = np.block([[dense, border], [border.T, np.zeros((1, 1))]])
+    return np.linalg.inv(bordered)[:-1, :-1]

@@ -1,0 +1,100 @@
+"""The matrix of a problem with conditions, on the host, and whether it is singular."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+
+from ..cloud import is_concrete
+from ..stencils.stencil import Stencil
+
+# Row sums up to this many times round-off are those of an operator that annihilates constants.
+_ROUNDOFF = 32
+
+
+def reduced_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
+    """P A E with the identity at bound points, as a CSR matrix.
+
+    Raises:
+        ValueError: traced or non-finite weights, or a zero row.
+    """
+    leaves = jax.tree.leaves((operator, conditions))
+    if not is_concrete(*leaves):
+        raise ValueError(
+            "multigrid is set up on concrete arrays: call js.multigrid outside jit and grad, "
+            "and pass its result as `preconditioner`"
+        )
+    matrix = _compressed(operator) if isinstance(operator, Stencil) else operator.to_scipy()
+    if not np.isfinite(matrix.data).all():
+        i = np.searchsorted(matrix.indptr, np.argmin(np.isfinite(matrix.data)), "right") - 1
+        raise ValueError(f"the operator has weights that are not finite, first at point {i}")
+    if conditions is not None:
+        if conditions.n != operator.n:
+            raise ValueError(f"conditions for {conditions.n} points, the operator has {operator.n}")
+        bound = np.asarray(conditions.bound)
+        free = scipy.sparse.diags((~bound).astype(matrix.dtype))
+        matrix = free @ matrix @ conditions.to_scipy() + scipy.sparse.diags(
+            bound.astype(matrix.dtype)
+        )
+        matrix = matrix.tocsr()
+        matrix.eliminate_zeros()
+    empty = np.flatnonzero(np.diff(matrix.indptr) == 0)
+    if empty.size:
+        raise ValueError(
+            f"row {empty[0]} of the operator is zero ({empty.size} such rows): nothing "
+            "determines the value there"
+        )
+    return matrix
+
+
+def _compressed(stencil) -> scipy.sparse.csr_matrix:
+    """The matrix of a scalar stencil; rows are in the order of the slots, which is fast."""
+    k, n = stencil.indices.shape
+    columns, weights = (
+        np.ascontiguousarray(np.asarray(a).T).ravel() for a in (stencil.indices, stencil.weights)
+    )
+    pointers = np.arange(0, k * n + 1, k, dtype=np.int32)
+    matrix = scipy.sparse.csr_matrix((weights, columns, pointers), shape=(n, n))
+    matrix.eliminate_zeros()
+    return matrix
+
+
+def annihilates_constants(matrix, conditions=None) -> bool:
+    """Whether the constants on the free points are in the null space, by the row sums.
+
+    Raises:
+        ValueError: they are on one of several disconnected parts.
+    """
+    free = np.ones(matrix.shape[0], bool)
+    if conditions is not None:
+        free[np.asarray(conditions.rows)] = False
+    # Entries of free rows are in free columns.
+    sums = np.abs(np.add.reduceat(matrix.data, matrix.indptr[:-1]))
+    sizes = np.add.reduceat(np.abs(matrix.data), matrix.indptr[:-1])
+    loose = free & (sums <= _ROUNDOFF * np.finfo(matrix.dtype).eps * sizes)
+    if not loose.any():
+        return False
+    count, part = scipy.sparse.csgraph.connected_components(matrix, directed=False)
+    tied = np.zeros(count, bool)
+    tied[part[free & ~loose]] = True
+    tied[part[~free]] = True
+    if tied.all():
+        return False
+    size = np.bincount(part[free], minlength=count)
+    parts = np.count_nonzero(size)
+    if parts == 1:
+        return True
+    i = int(np.flatnonzero(~tied)[0])
+    raise ValueError(
+        f"singular system: the points fall into {parts} parts that no stencil connects, and on "
+        f"the one of {size[i]} points around point {int(np.argmax(part == i))} the solution is "
+        "determined up to a constant only. Solve the parts one by one, or prescribe a value there"
+    )
+
+
+def check_scalar(operator) -> None:
+    if operator.in_shape or operator.out_shape:
+        shapes = f"{operator.in_shape} to {operator.out_shape}"
+        raise ValueError(f"an operator on scalar fields is needed, not from {shapes} components")

@@ -1,0 +1,152 @@
+r"""The square system on fields of all points that a steady problem is solved through."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..boundary import Closure
+from ..stencils.stencil import AbstractOperator
+from .padded import Layout, adjoint
+from .precondition import AbstractPreconditioner
+
+
+class _Square(lx.AbstractLinearOperator):
+    """A linear map of fields `(n,)` for lineax, of which nothing but products is known."""
+
+    def out_structure(self):
+        return self.in_structure()
+
+    def as_matrix(self):
+        raise NotImplementedError("an n x n array is what these operators avoid")
+
+
+class System(_Square):
+    r"""$P A E + (1 - P) - \sigma\, p\, p^T / p^T p$ with $p = P 1$.
+
+    Nonsingular where the problem has one solution (for an operator that annihilates the
+    constants: one up to a constant). The last term is symmetric, and the constants are an
+    eigenvector.
+
+    Args:
+        operator: A.
+        conditions: E, and P which keeps free points; None if all are free.
+        sigma: σ; None if the constants are not in the null space of P A E.
+        layout: of the transpose of A, if known.
+        dtype: of the fields.
+    """
+
+    operator: AbstractOperator
+    conditions: Closure | None
+    sigma: Float[Array, ""] | None
+    layout: Layout
+    dtype: np.dtype = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, operator, conditions, layout, dtype, mean_zero: bool) -> System:
+        plain = cls(operator, conditions, None, layout, np.dtype(dtype))
+        if not mean_zero:
+            return plain
+        # σ of the size and sign that keep the new eigenvalue among the others.
+        signs = plain.free(1.0 - 2.0 * (jnp.arange(operator.n) % 2).astype(dtype))
+        size = -jnp.vdot(signs, plain.mv(signs)) / jnp.vdot(signs, signs)
+        sigma = jax.lax.stop_gradient(jnp.where(size == 0, 1, size))
+        return cls(operator, conditions, sigma, layout, np.dtype(dtype))
+
+    def mv(self, vector):
+        u = vector if self.conditions is None else self.conditions.homogeneous(vector)
+        return self.free(self.operator(u)) + self.rest(vector)
+
+    def rest(self, v):
+        """What is added to P A E."""
+        return v - self.free(v) + self.constant(self.shift(v))
+
+    def free(self, v):
+        """P v."""
+        return v if self.conditions is None else self.conditions.restrict(v)
+
+    def constant(self, value):
+        """p times a number."""
+        return self.free(jnp.broadcast_to(jnp.asarray(value, self.dtype), self.operator.n))
+
+    def mean(self, v):
+        """Over free points."""
+        count = self.operator.n - (0 if self.conditions is None else self.conditions.m)
+        return jnp.sum(self.free(v)) / count
+
+    def shift(self, v):
+        r"""$-\sigma$ times the mean: where the system holds, $P A E v = f - p\,$ shift(v)."""
+        return jnp.zeros((), self.dtype) if self.sigma is None else -self.sigma * self.mean(v)
+
+    def transpose(self):
+        return Transposed(self, adjoint(self.operator, self.layout))
+
+    def in_structure(self):
+        return jax.ShapeDtypeStruct((self.operator.n,), self.dtype)
+
+
+class Transposed(_Square):
+    """The transpose of a system, the weights of its operator gathered once."""
+
+    system: System
+    adjoint: Callable | None
+
+    def mv(self, vector):
+        system, shape = self.system, self.in_structure()
+        v = system.free(vector)
+        if self.adjoint is None:
+            (v,) = jax.linear_transpose(system.operator, shape)(v)
+        else:
+            v = self.adjoint(v)
+        if system.conditions is not None:
+            (v,) = jax.linear_transpose(system.conditions.homogeneous, shape)(v)
+        return v + system.rest(vector)
+
+    def transpose(self):
+        return self.system
+
+    def in_structure(self):
+        return self.system.in_structure()
+
+
+class Inverse(_Square):
+    """A preconditioner for a system: exact on the constants of a mean-zero problem."""
+
+    preconditioner: AbstractPreconditioner
+    system: System
+
+    def mv(self, vector):
+        system = self.system
+        if system.sigma is None:
+            return self.preconditioner(vector).astype(vector.dtype)
+        off = lambda v: v - system.constant(system.mean(v))
+        inner = off(self.preconditioner(off(vector)).astype(vector.dtype))
+        return inner - system.constant(system.mean(vector) / system.sigma)
+
+    def transpose(self):
+        return Inverse(self.preconditioner.transpose(), self.system)
+
+    def in_structure(self):
+        return self.system.in_structure()
+
+
+for _kind in (System, Transposed, Inverse):
+    lx.linearise.register(_kind, lambda operator: operator)
+    lx.conj.register(_kind, lambda operator: operator)
+    for _property in (
+        lx.is_symmetric,
+        lx.is_diagonal,
+        lx.is_tridiagonal,
+        lx.is_lower_triangular,
+        lx.is_upper_triangular,
+        lx.is_positive_semidefinite,
+        lx.is_negative_semidefinite,
+        lx.has_unit_diagonal,
+    ):
+        _property.register(_kind, lambda operator: False)

@@ -1,0 +1,1 @@
+"""Problems in time, solvers for them, and the call that brings the two together."""

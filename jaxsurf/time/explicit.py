@@ -1,0 +1,228 @@
+r"""Runge–Kutta–Chebyshev: explicit steps whose stable length grows with the square of the work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ClassVar, Literal, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
+
+# Damping of the stability polynomial: the strip around the negative real axis that it covers.
+_DAMPING = 2 / 13
+# Steps between two estimates of the spectral radius, applications in the first and in later ones.
+_REFRESH, _FIRST, _LATER = 25, 20, 4
+# A power iteration sees the radius from below.
+_SAFETY = 1.2
+
+
+class _State(NamedTuple):
+    """What one step hands to the next.
+
+    Args:
+        rate: right-hand side at the current state.
+        radius: estimate of the spectral radius of its Jacobian.
+        direction: field that the Jacobian stretches most.
+        age: steps since the estimate.
+    """
+
+    rate: PyTree[Array]
+    radius: Float[Array, ""]
+    direction: PyTree[Array]
+    age: Int[Array, ""]
+
+
+class RKC2(dfx.AbstractAdaptiveSolver):
+    r"""Runge–Kutta–Chebyshev method of second order with as many stages as stability asks for.
+
+    With s stages a step is stable for eigenvalues in $[-0.65\,s^2/\Delta t, 0]$ and a thin strip
+    around it: s explicit stages do the work of $s^2/4$ stages of a common explicit method.
+    For diffusion, of any even order, without strong advection. A diffrax solver:
+    pass it to `js.integrate` or to `diffrax.diffeqsolve` with an `ODETerm`.
+
+    $s = 1 + \lfloor\sqrt{1 + 1.54\,\Delta t\,\rho}\rfloor$ follows from the step and the spectral
+    radius ρ of the right-hand side's Jacobian. The number of stages is a value, not a shape:
+    nothing is compiled again when it changes.
+
+    Args:
+        spectral_radius: ρ, or a bound of it; if None, estimated by power iterations at the
+            first step and again every 25 steps, with a margin of 20 per cent.
+        max_stages: the largest s. A step that needs more is refused: an adaptive controller
+            shortens it, with a constant step the integration stops with a result code.
+        loop: how the loop over stages is differentiated: `"checkpointed"` in reverse mode,
+            `"lax"` in forward mode (with `diffrax.ForwardMode`), `"bounded"` in both (with
+            `diffrax.DirectAdjoint`). `js.integrate` sets it.
+
+    Accuracy: second order; the embedded estimate of the local error is of third order
+    (`tests/test_time_explicit.py`).
+    Differentiable: forward and reverse, in the state and everything the right-hand side
+    depends on. The number of stages and ρ are not differentiated.
+    Raises:
+        ValueError: fewer than two stages allowed.
+    Source: Sommeijer, Shampine and Verwer, RKC: an explicit solver for parabolic PDEs,
+        J. Comput. Appl. Math. 88 (1998), Section 2.
+
+    Example:
+        >>> laplacian = js.laplace_beltrami(js.sphere(500))
+        >>> import diffrax
+        >>> term = diffrax.ODETerm(lambda t, u, args: laplacian(u))
+        >>> z = js.sphere(500).points[:, 2]
+        >>> u = diffrax.diffeqsolve(term, js.RKC2(), 0.0, 0.5, 0.05, z).ys[0]
+        >>> bool(jnp.abs(u - jnp.exp(-1.0) * z).max() < 0.01)
+        True
+    """
+
+    spectral_radius: ArrayLike | None = None
+    max_stages: int = eqx.field(static=True, default=200)
+    loop: Literal["checkpointed", "lax", "bounded"] = eqx.field(static=True, default="checkpointed")
+
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar = dfx.ThirdOrderHermitePolynomialInterpolation
+
+    def __check_init__(self):
+        if self.max_stages < 2:
+            raise ValueError(f"max_stages = {self.max_stages}, at least 2 stages are needed")
+
+    def order(self, terms):
+        return 2
+
+    def error_order(self, terms):
+        return 3
+
+    @property
+    def reach(self) -> float:
+        """Longest stable step, times the spectral radius."""
+        return (self.max_stages - 1) ** 2 / 1.54 - 1
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+    def init(self, terms, t0, t1, y0, args):
+        rate = terms.vf(t0, y0, args)
+        real = jnp.result_type(*jax.tree.leaves(y0), float)
+        age = jnp.asarray(0)
+        if self.spectral_radius is not None:
+            return _State(rate, jnp.asarray(self.spectral_radius, real), None, age)
+        start = jax.tree.map(_noise, y0)
+        radius, direction = _power(terms, t0, y0, args, rate, start, _FIRST)
+        return _State(rate, radius, direction, age)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        state = self._refreshed(terms, t0, y0, args, solver_state)
+        span = terms.contr(t0, t1)
+        k0 = terms.prod(state.rate, span)
+        need = 1.54 * jax.lax.stop_gradient(jnp.abs(t1 - t0)) * state.radius
+        stages = 1 + jnp.floor(jnp.sqrt(1 + need))
+        enough = stages <= self.max_stages  # also False for a radius that is not finite
+        stages = jnp.where(enough, stages, 2).astype(jnp.int32)
+
+        def increment(fraction, y):
+            return terms.vf_prod(t0 + fraction * (t1 - t0), y, args, span)
+
+        y1 = _chebyshev(increment, y0, k0, stages, self.max_stages, self.loop)
+        rate = terms.vf(t1, y1, args)
+        k1 = terms.prod(rate, span)
+        error = jax.tree.map(lambda a, b, p, q: 0.8 * (a - b) + 0.4 * (p + q), y0, y1, k0, k1)
+        error = jax.tree.map(lambda e: jnp.where(enough, e, jnp.inf), error)
+        result = dfx.RESULTS.where(enough, dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence)
+        dense = dict(y0=y0, y1=y1, k0=k0, k1=k1)
+        return y1, error, dense, state._replace(rate=rate, age=state.age + 1), result
+
+    def _refreshed(self, terms, t0, y0, args, state: _State) -> _State:
+        if self.spectral_radius is not None:
+            return state
+
+        def again():
+            radius, direction = _power(terms, t0, y0, args, state.rate, state.direction, _LATER)
+            return state._replace(radius=radius, direction=direction, age=jnp.zeros_like(state.age))
+
+        return jax.lax.cond(state.age < _REFRESH, lambda: state, again)
+
+
+def _chebyshev(
+    increment: Callable, y0: PyTree[Array], k0: PyTree[Array], stages, max_stages: int, loop
+) -> PyTree[Array]:
+    r"""The stages $Y_0, \dots, Y_s$ of one step (eqs. 2.4 to 2.6); returns the last.
+
+    Args:
+        increment: (c, y) -> Δt times the right-hand side at t + c Δt.
+        y0, k0: the state, and its increment.
+    """
+    dtype = jnp.result_type(*jax.tree.leaves(y0))
+    s2 = stages.astype(dtype) ** 2
+    w0 = 1 + _DAMPING / s2
+    # T_s and its derivatives at w0 = cosh(angle).
+    angle = jnp.arccosh(w0)
+    sinh2 = w0**2 - 1
+    s = jnp.sqrt(s2)
+    first = s * jnp.sinh(s * angle) / jnp.sqrt(sinh2)
+    second = (s2 * jnp.cosh(s * angle) - w0 * first) / sinh2
+    w1 = first / second
+
+    # Chebyshev polynomials and two derivatives, of degrees j - 1 and j - 2.
+    zero, one = jnp.zeros_like(w0), jnp.ones_like(w0)
+    polynomials = jnp.stack([w0, one, zero]), jnp.stack([one, zero, zero])
+    b = 1 / (4 * w0**2)
+    y1 = jax.tree.map(lambda y, k: y + b * w1 * k, y0, k0)
+
+    def unfinished(carry):
+        return carry[0] <= stages
+
+    def stage(carry):
+        j, (last, before), (b_last, b_before), c, (y_last, y_before) = carry
+        chain = jnp.stack([zero, 2 * last[0], 4 * last[1]])
+        now = 2 * w0 * last - before + chain
+        b_now = now[2] / now[1] ** 2
+        mu = 2 * b_now * w0 / b_last
+        nu = -b_now / b_before
+        mu_k = 2 * b_now * w1 / b_last
+        gamma_k = -(1 - b_last * last[0]) * mu_k
+        k = increment(c, y_last)
+        y = jax.tree.map(
+            lambda y0, y_last, y_before, k, k0: (
+                (1 - mu - nu) * y0 + mu * y_last + nu * y_before + mu_k * k + gamma_k * k0
+            ),
+            y0, y_last, y_before, k, k0,
+        )  # fmt: skip
+        return j + 1, (now, last), (b_now, b_last), w1 * now[2] / now[1], (y, y_last)
+
+    c1 = w1 * (1 / w0) / (4 * w0)  # c_2 / T_2'(w0), with c_2 = w1 T_2'' / T_2'
+    carry = (jnp.asarray(2, stages.dtype), polynomials, (b, b), c1, (y1, y0))
+    return eqxi.while_loop(unfinished, stage, carry, max_steps=max_stages, kind=loop)[-1][0]
+
+
+def _power(terms, t, y, args, rate, direction, count: int):
+    """Spectral radius of the Jacobian by power iterations on differences, and its direction."""
+    terms, y, args, rate, direction = _frozen((terms, y, args, rate, direction))
+    eps = jnp.finfo(jnp.result_type(*jax.tree.leaves(y))).eps
+    size = jnp.sqrt(eps) * jnp.maximum(_norm(y), 1)
+
+    def multiply(carry, _):
+        v, _ = carry
+        scale = size / _norm(v)
+        moved = terms.vf(t, jax.tree.map(lambda y, v: y + scale * v, y, v), args)
+        v = jax.tree.map(lambda a, b: (a - b) / size, moved, rate)
+        length = _norm(v)
+        kept = jax.tree.map(lambda v, d: jnp.where(length > 0, v, d), v, direction)
+        return (kept, length), None
+
+    (v, length), _ = jax.lax.scan(multiply, (direction, jnp.zeros_like(size)), length=count)
+    return _frozen((_SAFETY * length, v))
+
+
+def _frozen(tree):
+    """The same values, constants to differentiation."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+
+
+def _norm(y: PyTree[Array]) -> Float[Array, ""]:
+    return jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(y)))
+
+
+def _noise(y: Array) -> Array:
+    return jnp.asarray(np.random.default_rng(0).normal(size=y.shape), y.dtype)

@@ -1,0 +1,384 @@
+r"""Implicit Runge–Kutta steps without matrices: every linear system by a Krylov method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jaxtyping import Array, PyTree
+
+Preconditioner = Callable[[Any], lx.AbstractLinearOperator]
+
+
+class Tableau(eqx.Module):
+    """Coefficients of an additive Runge–Kutta method whose stages are solved one after another.
+
+    Args:
+        explicit, implicit: strictly lower rows, stage by stage.
+        diagonal: of the implicit part.
+        nodes: times of the stages, as fractions of the step.
+        weights: of the result.
+        errors: weights of the result minus those of the embedded one.
+    """
+
+    explicit: Sequence[np.ndarray]
+    implicit: Sequence[np.ndarray]
+    diagonal: np.ndarray
+    nodes: np.ndarray
+    weights: np.ndarray
+    errors: np.ndarray
+
+    @classmethod
+    def of(cls, explicit: dfx.ButcherTableau, implicit: dfx.ButcherTableau) -> Tableau:
+        return cls(
+            (np.zeros(0), *explicit.a_lower),
+            (np.zeros(0), *implicit.a_lower),
+            np.asarray(implicit.a_diagonal),
+            np.append(0.0, implicit.c),
+            np.asarray(implicit.b_sol),
+            np.asarray(implicit.b_error),
+        )
+
+
+def _ark2() -> Tableau:
+    """Giraldo, Kelly and Constantinescu (2013), eqs. 3.8 and 3.9."""
+    root = np.sqrt(2.0)
+    gamma, delta = 1 - 1 / root, 1 / (2 * root)
+    last = (3 + 2 * root) / 6
+    weights = np.array([delta, delta, gamma])
+    embedded = np.array([(4 - root) / 8, (4 - root) / 8, delta])
+    return Tableau(
+        (np.zeros(0), np.array([2 * gamma]), np.array([1 - last, last])),
+        (np.zeros(0), np.array([gamma]), np.array([delta, delta])),
+        np.array([0, gamma, gamma]),
+        np.array([0, 2 * gamma, 1]),
+        weights,
+        weights - embedded,
+    )
+
+
+_IMEX = {
+    2: _ark2(),
+    3: Tableau.of(*dfx.KenCarp3.tableau.tableaus),
+    4: Tableau.of(*dfx.KenCarp4.tableau.tableaus),
+}
+_SDIRK = {
+    order: Tableau.of(tableau, tableau)
+    for order, tableau in ((3, dfx.Kvaerno3.tableau), (4, dfx.Kvaerno4.tableau))
+}
+
+
+class IMEX(dfx.AbstractAdaptiveSolver):
+    r"""Implicit–explicit Runge–Kutta steps: the stiff linear part L implicit, the rest explicit.
+
+    Each stage solves $(I - \gamma\,\Delta t\,L)\,y = r$ by a Krylov method on the action of L.
+    A diffrax solver for `MultiTerm(ODETerm(rest), ODETerm(linear))`; `js.integrate` makes
+    the terms.
+
+    Args:
+        order: 2 (three stages; Giraldo, Kelly and Constantinescu 2013), 3 or 4 (four and six
+            stages; Kennedy and Carpenter 2003), each with an embedded method one order lower.
+            All are L-stable in the implicit part.
+        solver: of the linear systems; by default BiCGStab (GMRES in single precision).
+        tolerance: largest residual of a linear system over its right-hand side; by default
+            the 0.6th power of the rounding unit, 4e-10 in double precision.
+        preconditioner: function of $\gamma\,\Delta t$ that returns an approximate inverse of
+            $I - \gamma\,\Delta t\,L$ as a lineax operator; None for small steps.
+
+    Accuracy: the order given, in time (`tests/test_time_implicit.py`).
+    Differentiable: forward and reverse, by the implicit function theorem; nothing of size n × n
+    is ever made.
+    Raises:
+        ValueError: another order.
+
+    Example:
+        >>> laplacian = js.laplace_beltrami(js.sphere(500))
+        >>> problem = js.AdvectionDiffusionReaction(laplacian)
+        >>> z = js.sphere(500).points[:, 2]
+        >>> u = js.integrate(problem, z, t1=0.5, solver=js.IMEX(order=3)).ys[-1]
+        >>> bool(jnp.abs(u - jnp.exp(-1.0) * z).max() < 0.01)
+        True
+    """
+
+    scheme: int = eqx.field(static=True)
+    solver: lx.AbstractLinearSolver | None
+    tolerance: float | None
+    preconditioner: Preconditioner | None
+
+    term_structure: ClassVar = dfx.MultiTerm[tuple[dfx.AbstractTerm, dfx.AbstractTerm]]
+    interpolation_cls: ClassVar = dfx.ThirdOrderHermitePolynomialInterpolation
+
+    def __init__(
+        self,
+        order: int = 3,
+        *,
+        solver: lx.AbstractLinearSolver | None = None,
+        tolerance: float | None = None,
+        preconditioner: Preconditioner | None = None,
+    ):
+        self.scheme = _known(order, _IMEX)
+        self.solver, self.tolerance, self.preconditioner = solver, tolerance, preconditioner
+
+    def order(self, terms):
+        return self.scheme
+
+    def func(self, terms, t0, y0, args):
+        return _sum([term.vf(t0, y0, args) for term in terms.terms])
+
+    def init(self, terms, t0, t1, y0, args):
+        return tuple(term.vf(t0, y0, args) for term in terms.terms)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        implicit = terms.terms[1]
+        span = implicit.contr(t0, t1)
+        solver = _relative(self.solver, self.tolerance, y0)
+
+        def solve(t, known, start, factor):
+            def residual_free(y):
+                return _combine(y, [-factor], [implicit.vf_prod(t, y, args, span)])
+
+            operator = lx.FunctionLinearOperator(residual_free, jax.eval_shape(lambda: y0))
+            options = {}
+            if self.preconditioner is not None:
+                options["preconditioner"] = self.preconditioner(factor * (t1 - t0))
+            rest = jax.tree.map(jnp.subtract, known, operator.mv(start))
+            found = lx.linear_solve(operator, rest, solver, options=options, throw=False)
+            y = jax.tree.map(jnp.add, start, found.value)
+            return y, dfx.RESULTS.promote(found.result)
+
+        rates = tuple(terms.terms)
+        return _steps(_IMEX[self.scheme], rates, solve, t0, t1, y0, args, solver_state)
+
+
+class SDIRK(dfx.AbstractAdaptiveSolver):
+    r"""Singly diagonally implicit Runge–Kutta steps by Newton–Krylov: for stiff reactions.
+
+    Each stage solves $y - \gamma\,\Delta t\,f(t, y) = r$ for the whole right-hand side f by
+    Newton's method; its linear systems by a Krylov method on Jacobian–vector products. A
+    diffrax solver for an `ODETerm`.
+
+    Args:
+        order: 3 (four stages) or 4 (five), with an embedded method one order lower (Kværnø
+            2004). L-stable.
+        solver, tolerance: as in `IMEX`; a stage has converged when the norm of its residual is
+            below the tolerance times that of the state.
+        preconditioner: function of $\gamma\,\Delta t$ that returns an approximate inverse of
+            $I - \gamma\,\Delta t\,f'$; None for small steps.
+        newton_steps: largest number of Newton steps; a stage that needs more is refused, and
+            an adaptive controller shortens the step.
+
+    Accuracy: the order given, in time (`tests/test_time_implicit.py`).
+    Differentiable: forward and reverse, by the implicit function theorem; nothing of size n × n
+    is ever made.
+    Raises:
+        ValueError: another order.
+    """
+
+    scheme: int = eqx.field(static=True)
+    solver: lx.AbstractLinearSolver | None
+    tolerance: float | None
+    preconditioner: Preconditioner | None
+    newton_steps: int = eqx.field(static=True)
+
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar = dfx.ThirdOrderHermitePolynomialInterpolation
+
+    def __init__(
+        self,
+        order: int = 3,
+        *,
+        solver: lx.AbstractLinearSolver | None = None,
+        tolerance: float | None = None,
+        preconditioner: Preconditioner | None = None,
+        newton_steps: int = 12,
+    ):
+        self.scheme = _known(order, _SDIRK)
+        self.solver, self.tolerance, self.preconditioner = solver, tolerance, preconditioner
+        self.newton_steps = newton_steps
+
+    def order(self, terms):
+        return self.scheme
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+    def init(self, terms, t0, t1, y0, args):
+        return (terms.vf(t0, y0, args),)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        span = terms.contr(t0, t1)
+        tolerance = _tolerance(self.tolerance, y0)
+
+        def solve(t, known, start, factor):
+            def residual(y):
+                change = terms.vf_prod(t, y, args, span)
+                return jax.tree.map(lambda y, k, r: y - factor * k - r, y, change, known)
+
+            options = {}
+            if self.preconditioner is not None:
+                options["preconditioner"] = self.preconditioner(factor * (t1 - t0))
+            inner = _relative(self.solver, _FORCING, y0)
+            outer = _relative(self.solver, self.tolerance, y0)
+            structure = jax.eval_shape(lambda: y0)
+
+            def newton(residual, start):
+                target = tolerance * jnp.maximum(_norm(start), _norm(known))
+
+                def unfinished(carry):
+                    _, r, count = carry
+                    return (_norm(r) > target) & (count < self.newton_steps)
+
+                def improve(carry):
+                    y, r, count = carry
+                    slope = lx.FunctionLinearOperator(jax.linearize(residual, y)[1], structure)
+                    step = lx.linear_solve(slope, r, inner, options=options, throw=False).value
+                    y = jax.tree.map(jnp.subtract, y, step)
+                    return y, residual(y), count + 1
+
+                carry = (start, residual(start), 0)
+                y, r, _ = jax.lax.while_loop(unfinished, improve, carry)
+                return y, (_norm(r) <= target).astype(_norm(r).dtype)
+
+            def tangent(slope, vector):
+                operator = lx.FunctionLinearOperator(slope, structure)
+                return lx.linear_solve(operator, vector, outer, options=options, throw=False).value
+
+            y, converged = jax.lax.custom_root(residual, start, newton, tangent, has_aux=True)
+            return y, dfx.RESULTS.where(
+                converged > 0, dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence
+            )
+
+        return _steps(_SDIRK[self.scheme], (terms,), solve, t0, t1, y0, args, solver_state)
+
+
+# Residual of a Newton step's linear system over its right-hand side.
+_FORCING = 1e-2
+
+
+def _steps(tableau: Tableau, terms, solve, t0, t1, y0, args, rates):
+    """All stages of one step, for one term (implicit) or two (explicit, implicit).
+
+    Args:
+        solve: (t, r, start, γ) -> y with y - γ Δt f(t, y) = r, and its result code.
+        rates: the terms at the start of the step, from the step before.
+    """
+    span = [term.contr(t0, t1) for term in terms]
+    # Increments, stage by stage.
+    explicit: list[PyTree[Array]] = []
+    implicit: list[PyTree[Array]] = []
+    y, ok = y0, dfx.RESULTS.successful
+    for i, (gamma, node) in enumerate(zip(tableau.diagonal, tableau.nodes)):
+        t = t0 + node * (t1 - t0)
+        if i == 0:
+            increments = [term.prod(rate, s) for term, rate, s in zip(terms, rates, span)]
+        else:
+            known = _combine(y0, tableau.implicit[i], implicit)
+            if len(terms) == 2:
+                known = _combine(known, tableau.explicit[i], explicit)
+            y, result = solve(t, known, y, gamma)
+            ok = dfx.RESULTS.where(ok == dfx.RESULTS.successful, result, ok)
+            increments = [term.vf_prod(t, y, args, s) for term, s in zip(terms, span)]
+        implicit.append(increments[-1])
+        explicit.append(increments[0])
+    total = implicit if len(terms) == 1 else [_sum(pair) for pair in zip(explicit, implicit)]
+    y1 = _combine(y0, tableau.weights, total)
+    zero = jax.tree.map(jnp.zeros_like, y0)
+    failed = ok != dfx.RESULTS.successful
+    error = _combine(zero, tableau.errors, total)
+    error = jax.tree.map(lambda e: jnp.where(failed, jnp.inf, e), error)
+    rates = tuple(term.vf(t1, y1, args) for term in terms)
+    k1 = _sum([term.prod(rate, s) for term, rate, s in zip(terms, rates, span)])
+    return y1, error, dict(y0=y0, y1=y1, k0=total[0], k1=k1), rates, ok
+
+
+class _Relative(lx.AbstractLinearSolver):
+    """A linear solver whose tolerance is relative to the norm of the right-hand side.
+
+    Krylov solvers of lineax weigh the residual point by point with the right-hand side, which
+    may vanish somewhere; here it is brought to norm one. The residual is then computed afresh,
+    because the recursions of BiCGStab may lose it.
+    """
+
+    solver: lx.AbstractLinearSolver
+    tolerance: Any
+
+    def init(self, operator, options):
+        return self.solver.init(operator, options), operator
+
+    def compute(self, state, vector, options):
+        inner, operator = state
+        norm = _norm(vector)
+        scale = jnp.where(norm > 0, norm, 1)
+        unit = jax.tree.map(lambda v: v / scale, vector)
+        x, result, stats = self.solver.compute(inner, unit, options)
+        residual = jax.tree.map(jnp.subtract, operator.mv(x), unit)
+        good = _norm(residual) <= 10 * self.tolerance
+        result = lx.RESULTS.where(
+            good,
+            lx.RESULTS.successful,
+            lx.RESULTS.where(result == lx.RESULTS.successful, lx.RESULTS.stagnation, result),
+        )
+        return jax.tree.map(lambda x: scale * x, x), result, stats
+
+    def transpose(self, state, options):
+        inner, operator = state
+        inner, options = self.solver.transpose(inner, options)
+        return (inner, operator.transpose()), options
+
+    def conj(self, state, options):
+        inner, operator = state
+        inner, options = self.solver.conj(inner, options)
+        return (inner, lx.conj(operator)), options
+
+    def assume_full_rank(self):
+        return True
+
+
+def _relative(solver: lx.AbstractLinearSolver | None, tolerance, y: PyTree[Array]) -> _Relative:
+    tolerance = _tolerance(tolerance, y)
+    if solver is None:
+        kind = lx.BiCGStab if _dtype(y) == jnp.float64 else lx.GMRES
+        solver = kind(rtol=0.0, atol=tolerance, norm=_norm, max_steps=_KRYLOV_STEPS)
+    return _Relative(solver, tolerance)
+
+
+# A system that needs more Krylov steps than this wants a preconditioner or a shorter step.
+_KRYLOV_STEPS = 500
+
+
+def _tolerance(tolerance, y: PyTree[Array]) -> float:
+    return float(jnp.finfo(_dtype(y)).eps) ** 0.6 if tolerance is None else tolerance
+
+
+def _dtype(y: PyTree[Array]):
+    return jnp.result_type(*jax.tree.leaves(y))
+
+
+def _norm(y: PyTree[Array]) -> Array:
+    """Root mean square of all entries."""
+    leaves = jax.tree.leaves(y)
+    return jnp.sqrt(sum(jnp.sum(a * a) for a in leaves) / sum(a.size for a in leaves))
+
+
+def _combine(y: PyTree[Array], weights, increments: Sequence[PyTree[Array]]) -> PyTree[Array]:
+    """y plus the weighted sum of increments."""
+    for weight, increment in zip(weights, increments):
+        if not (isinstance(weight, float | np.floating) and weight == 0):
+            y = jax.tree.map(lambda y, k, w=weight: y + w * k, y, increment)
+    return y
+
+
+def _sum(trees: Sequence[PyTree[Array]]) -> PyTree[Array]:
+    return jax.tree.map(lambda *leaves: sum(leaves[1:], leaves[0]), *trees)
+
+
+def _known(order: int, table: dict) -> int:
+    if order not in table:
+        raise ValueError(f"order = {order}, there are {', '.join(map(str, sorted(table)))}")
+    return order

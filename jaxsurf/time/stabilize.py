@@ -1,0 +1,98 @@
+r"""Numerical damping for advection and waves, of the size of what the points do not resolve."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from ..cloud import PointCloud
+from ..neighbors import Neighbors, find_neighbors
+from ..operators import diffusion
+from ..spectrum import spectral_estimate
+from ..stencils.dcpse import DCPSE
+from ..stencils.method import AbstractMethod
+from ..stencils.stencil import AbstractOperator, Stencil
+
+
+def hyperviscosity(
+    laplacian: Stencil,
+    speed: ArrayLike,
+    *,
+    power: int = 2,
+    strength: float = 0.5,
+    spectral_radius: float | None = None,
+) -> AbstractOperator:
+    r"""Damping $-\nu\,(-\Delta_S)^p$ that acts on the shortest waves and spares the others.
+
+    $\nu = \alpha\,c\,\rho^{1/2 - p}$ with ρ the Laplacian's spectral radius: the shortest wave is
+    damped at α times the rate $c\sqrt\rho$ at which it is carried along, a wave of wavenumber
+    k at $\alpha\,c\,k\,(k/\sqrt\rho)^{2p - 1}$. Central stencils on scattered points give
+    advection eigenvalues with positive real part; this moves them back to the left.
+
+    Args:
+        laplacian: the Laplace–Beltrami operator.
+        speed: c, the largest speed of the flow or of the waves.
+        power: p; the error made is $O(h^{2p - 1})$.
+        strength: α.
+        spectral_radius: ρ; estimated if None (the operator must then be concrete).
+
+    Returns:
+        The damping, to be added to the right-hand side: `stabilization=` of the problems.
+
+    Raises:
+        ValueError: a power below one, a strength that is not positive.
+    """
+    if power < 1:
+        raise ValueError(f"power = {power}, at least 1 is needed")
+    if not strength > 0:
+        raise ValueError(f"strength = {strength}, a positive number is needed")
+    if spectral_radius is None:
+        spectral_radius = spectral_estimate(laplacian).radius
+    factor = strength * jnp.asarray(speed) * spectral_radius ** (0.5 - power)
+    damping: AbstractOperator = laplacian.scaled(-((-1) ** power) * factor)
+    for _ in range(power - 1):
+        damping = damping @ laplacian
+    return damping
+
+
+def upwinding(
+    cloud: PointCloud,
+    velocity: Float[Array, "n d"],
+    *,
+    neighbors: Neighbors | None = None,
+    method: AbstractMethod = DCPSE(order=2),
+    strength: float = 1.0,
+) -> Stencil:
+    r"""What turns central differences along a flow into one-sided ones, of first order.
+
+    Diffusion along the stream, $\nabla\cdot\left(\tfrac{\alpha h |v|}{2}\,
+    \hat v \hat v^{\mathsf T}\,\nabla u\right)$ with h the distance to the nearest neighbour: on
+    a line of points, central differences plus this with α = 1 are upwind differences.
+
+    Args:
+        cloud: n points in d dimensions with unit normals.
+        velocity: v, `(n, d)`.
+        neighbors: as `diffusion`.
+        method: how the weights are computed.
+        strength: α.
+
+    Returns:
+        The damping, to be added to the right-hand side: `stabilization=` of the problems.
+
+    Accuracy: first order; `hyperviscosity` costs accuracy of higher order only.
+    Differentiable: as `diffusion`; zeros of the velocity excepted.
+    Raises:
+        ValueError: as `diffusion`; a velocity of the wrong shape.
+    """
+    velocity = jnp.asarray(velocity)
+    if velocity.shape != cloud.points.shape:
+        raise ValueError(f"velocity has shape {velocity.shape}, expected {cloud.points.shape}")
+    spacing = cloud.spacing
+    if spacing is None:
+        from_nearest = find_neighbors(cloud, 2, throw=False)
+        offsets = cloud.points[from_nearest.indices[:, 1]] - cloud.points
+        spacing = jnp.linalg.norm(offsets, axis=1)
+    speed = jnp.linalg.norm(velocity, axis=1)
+    size = jnp.where(speed > 0, 0.5 * strength * spacing / jnp.where(speed > 0, speed, 1), 0)
+    tensor = size[:, None, None] * velocity[:, :, None] * velocity[:, None, :]
+    return diffusion(cloud, tensor, neighbors=neighbors, method=method)

@@ -72,7 +72,8 @@ class Border(eqx.Module):
 
         Returns:
             Foot points `(p, d)`, unit normals and outward conormals there, and the weights `(p, r)`
-            by which anything known on the border is carried to the foot.
+            by which what is known on the border is carried to the foot; a corner has no part
+            in them, as a flux has two values there.
         """
         rows, mask = self.rows[side, slot], self.mask[side, slot]
         points, normals = cloud.points[rows], cloud.normals[rows]
@@ -94,7 +95,9 @@ class Border(eqx.Module):
         foot = jnp.einsum("pr,prd->pd", value, points)
         tangent = jnp.einsum("pr,prd->pd", slope, points)
         normal = _unit(jnp.einsum("pr,prd->pd", value, normals))
-        return foot, normal, _unit(jnp.cross(tangent, normal)), value
+        conormal = _unit(jnp.cross(tangent, normal))
+        smooth = mask & ~jnp.isin(rows, self.points[self.corners])
+        return foot, normal, conormal, _lagrange(nodes, smooth, x)[0]
 
 
 _NEWTON = 3

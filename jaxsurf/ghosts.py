@@ -229,7 +229,8 @@ class _Across:
         keep &= ~beyond if corners is None else beyond
 
         condition = self.owner[spots[slot]]
-        shared = np.all(~used | (self.owner[row] == condition[:, None]), axis=1) & ~beyond
+        # Values of another condition say nothing here; the nearest point then speaks alone.
+        shared = np.all(~used | (self.owner[row] == condition[:, None]), axis=1)
         alone = np.arange(row.shape[1]) == 0
         carriers = np.where(shared[:, None], row, spots[slot][:, None])
         shares = np.where(shared[:, None], share, alone)

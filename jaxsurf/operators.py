@@ -371,7 +371,7 @@ def _adapted(cloud, method, throw, needed=True) -> tuple[Neighbors, tuple | None
     _check_sizes(cloud, neighbors, method, Laplacian(), throw)
     weights = stencil_weights(cloud, neighbors, method, Laplacian())
     border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
-    poor = np.flatnonzero(on & needed & _is_poor(*weights, border))
+    poor = np.flatnonzero(on & needed & _is_poor(weights, border))
     widths = [min(int(k * growth), available) for growth in _GROWTH]
     if not poor.size or widths[-1] == k:
         return neighbors, weights
@@ -384,7 +384,7 @@ def _adapted(cloud, method, throw, needed=True) -> tuple[Neighbors, tuple | None
     for width in widths[:-1]:
         narrow = Neighbors(jnp.asarray(indices), jnp.asarray(mask & _first(width, mask)))
         again = stencil_weights(cloud, narrow, method, Laplacian(), jnp.asarray(rows))
-        again = _is_poor(*again, border[rows])
+        again = _is_poor(again, border[rows])
         chosen = np.where(still & ~again, width, chosen)
         still &= again
     widest = chosen.max()
@@ -402,8 +402,8 @@ def _first(count, mask: np.ndarray) -> np.ndarray:
     return np.arange(mask.shape[1]) < count
 
 
-def _is_poor(weights, diagnostics, border) -> np.ndarray:
-    weights, residual = np.asarray(weights), np.asarray(diagnostics.residual)
+def _is_poor(stencils, border) -> np.ndarray:
+    weights, residual = np.asarray(stencils[0]), np.asarray(stencils[1].residual)
     others = np.sum(np.abs(weights[1:]), axis=0)
     dominant = border | (-weights[0] >= _DOMINANCE * others)
     return ~(dominant & (residual < _tolerance(weights.dtype)))

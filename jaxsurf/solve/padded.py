@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -29,11 +29,11 @@ class Table(NamedTuple):
         rows, others, sources: row, column and number of the entries beyond the k-th of their row.
     """
 
-    columns: np.ndarray
-    source: np.ndarray
-    rows: np.ndarray
-    others: np.ndarray
-    sources: np.ndarray
+    columns: Any
+    source: Any
+    rows: Any
+    others: Any
+    sources: Any
 
 
 def tabulate(indptr: np.ndarray, columns: np.ndarray, source: np.ndarray | None = None) -> Table:
@@ -150,7 +150,7 @@ class Incoming(eqx.Module):
                 "the preconditioner was made for other neighbours than the operator has: make it "
                 "for this operator",
             )
-        k, n = stencil.indices.shape
+        n = stencil.n
         own = stencil.indices == jnp.arange(n, dtype=stencil.indices.dtype)
         diagonal = jnp.sum(jnp.where(own, weights, 0), axis=0)
         values = weights.reshape(-1)

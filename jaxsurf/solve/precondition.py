@@ -124,8 +124,8 @@ class Multigrid(AbstractPreconditioner):
         # The prolongation is the transposed restriction: both stay. So do polynomials in
         # D⁻¹A times D⁻¹, with A transposed.
         levels = tuple(
-            Level(l.turned, l.matrix, l.inverse, l.restrict, l.prolong, l.damping[::-1])
-            for l in self.levels
+            Level(v.turned, v.matrix, v.inverse, v.restrict, v.prolong, v.damping)
+            for v in self.levels
         )
         return Multigrid(self.incoming, self.mean_zero, levels, self.coarsest.T)
 
@@ -231,7 +231,8 @@ def multigrid(
         aggregated = _aggregated(fine, constant)
         if aggregated is None:
             break
-        level, fine, constant = _level(fine, *aggregated, dtype)
+        tentative, constant = aggregated
+        level, fine = _level(fine, tentative, dtype)
         levels.append(level)
     if fine.shape[0] > 4 * _COARSEST:
         raise ValueError(
@@ -262,12 +263,17 @@ def _aggregated(matrix, constant):
     return scipy.sparse.csr_matrix(tentative), coarse[:, 0]
 
 
-def _level(matrix, tentative, coarse, dtype):
+def _level(matrix, tentative, dtype):
+    """A level, and the operator on the next one."""
     diagonal = matrix.diagonal()
     if np.any(diagonal == 0):
         i = int(np.flatnonzero(diagonal == 0)[0])
         raise ValueError(f"the diagonal of the operator is zero in row {i}: nothing to smooth with")
-    inverse = 1 / diagonal
+    # At points with a small diagonal (few, badly placed neighbours) plain Jacobi steps would
+    # diverge. Half the sum of a row's moduli, the diagonal where weights are of one sign,
+    # keeps the row sums of D⁻¹A below 2.
+    half = np.add.reduceat(np.abs(matrix.data), matrix.indptr[:-1]) / 2
+    inverse = np.sign(diagonal) / np.maximum(np.abs(diagonal), half)
     radius = _radius(matrix, inverse)
     # (I - w D⁻¹ A) T
     damped = matrix.copy()
@@ -283,7 +289,7 @@ def _level(matrix, tentative, coarse, dtype):
         pad(prolong),
         _chebyshev(radius, dtype),
     )
-    return level, (restrict @ (matrix @ prolong)).tocsr(), coarse
+    return level, (restrict @ (matrix @ prolong)).tocsr()
 
 
 def _radius(matrix, inverse, steps: int = 8) -> float:

@@ -1,4 +1,4 @@
-r"""Steady linear problems A u = f: with conditions, in the mean-zero sense, with exact gradients."""
+"""Steady linear problems A u = f, with conditions or in the mean-zero sense."""
 
 from __future__ import annotations
 

@@ -1,0 +1,256 @@
+r"""Steady problems with a reaction, $L u + r(u) = f$, by Newton's method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+import scipy.sparse
+from jaxtyping import Array, Float
+
+from ..boundary import Closure
+from ..cloud import is_concrete
+from ..stencils.stencil import AbstractOperator, Stencil
+from .krylov import BiCGStab
+from .precondition import AbstractPreconditioner, multigrid
+from .reduced import check_scalar
+from .system import Inverse, System
+
+# A step is accepted if the residual falls by this share of what the linear model promises.
+_ARMIJO = 1e-4
+# Residual of the linear systems of all steps but the last.
+_FORCING = 1e-4
+# Halvings of a step before the search is given up.
+_HALVINGS = 12
+
+Reaction = Callable[[Float[Array, " n"], Any], Float[Array, " n"]]
+
+
+def solve_nonlinear(
+    operator: AbstractOperator,
+    reaction: Reaction,
+    u0: Float[Array, " n"],
+    *,
+    args: Any = None,
+    rhs: Float[Array, " n"] | float = 0.0,
+    conditions: Closure | None = None,
+    preconditioner: AbstractPreconditioner | None = None,
+    solver: lx.AbstractLinearSolver | None = None,
+    rtol: float = 1e-8,
+    atol: float = 0.0,
+    max_steps: int = 30,
+    throw: bool = True,
+) -> optx.Solution:
+    r"""Solve $L u + r(u) = f$ at the free points, under conditions.
+
+    Newton's method: each step solves $(L + r'(u))\,\delta = f - L u - r(u)$ by a preconditioned
+    Krylov method, and is halved until the residual falls (Armijo's rule).
+
+    Args:
+        operator: L, a scalar stencil or a composition.
+        reaction: `reaction(u, args)`, pointwise: the value at a point depends on u there. (What
+            depends on neighbours belongs in the operator.)
+        u0: where to start, `(n,)`.
+        args: parameters of the reaction, any pytree; derivatives in them need them here.
+        rhs: f, `(n,)` or a number.
+        conditions: from `js.close` or `js.with_ghosts`.
+        preconditioner: for $L + r'$; `js.multigrid` of it at u0 if None, which takes concrete
+            arrays. One serves all steps.
+        solver: of the linear systems; `js.BiCGStab` if None, loosely but for derivatives.
+        rtol: the residual may be this share of its size at u0 (or of f, if that is larger).
+        atol: or this, whichever is larger.
+        max_steps: most Newton steps.
+        throw: raise where the iteration fails; if False, see `result`.
+
+    Returns:
+        An `optimistix.Solution`: `value`, `result`, and in `stats` `num_steps`,
+        `num_linear_steps` and `relative_residual`.
+
+    Accuracy: of the operator (`tests/test_newton.py`).
+    Differentiable: forward and reverse, in the weights of the operator, args, rhs and the
+    conditions, by one linear solve at the solution; not in u0.
+    Raises:
+        ValueError: shapes that do not fit; values that are not finite; under `jit`, no
+            preconditioner.
+        RuntimeError: no convergence (with steps and residual).
+
+    Example:
+        >>> cloud = js.sphere(1_000)
+        >>> z = cloud.points[:, 2]
+        >>> screened = js.laplace_beltrami(cloud).scaled(-1.0)
+        >>> f = 2 * z + z + z**3
+        >>> u = js.solve_nonlinear(screened, lambda u, _: u + u**3, 0 * z, rhs=f).value
+        >>> bool(jnp.abs(u - z).max() < 0.01)
+        True
+    """
+    check_scalar(operator)
+    u0 = jnp.asarray(u0)
+    u0 = u0.astype(jnp.result_type(u0, *jax.tree.leaves(operator), jnp.float32))
+    rhs = jnp.asarray(rhs, u0.dtype)
+    if u0.shape != (operator.n,) or rhs.shape not in ((), u0.shape):
+        raise ValueError(
+            f"u0 has shape {u0.shape} and the right-hand side {rhs.shape}, expected ({operator.n},)"
+        )
+    if is_concrete(u0, rhs) and not (np.isfinite(u0).all() and np.isfinite(rhs).all()):
+        name, values = ("u0", u0) if not np.isfinite(u0).all() else ("right-hand side", rhs)
+        i = int(np.argmin(np.isfinite(np.ravel(values))))
+        raise ValueError(f"{name} is not finite at point {i}")
+    problem = _Problem(operator, conditions, reaction, args, rhs)
+    if preconditioner is None:
+        preconditioner = multigrid(_shifted(operator, problem.slope(u0)), conditions=conditions)
+    if preconditioner.mean_zero:
+        raise ValueError(
+            "singular at u0: the operator annihilates the constants and the reaction has slope "
+            "zero. Start elsewhere, or solve a linear problem with js.solve"
+        )
+    concrete = is_concrete(*jax.tree.leaves((problem, u0, preconditioner)))
+    limits = (rtol, atol, max_steps, throw and not concrete)
+    solution = _solve(problem, u0, preconditioner, solver, *limits)
+    if throw and concrete and bool(solution.result != optx.RESULTS.successful):
+        raise RuntimeError(
+            f"not solved: relative residual {float(solution.stats['relative_residual']):.1e} after "
+            f"{int(solution.stats['num_steps'])} Newton steps, wanted rtol = {rtol:g}, atol = "
+            f"{atol:g}. The start may be far from a solution, or the system singular there; "
+            "throw=False returns what was reached"
+        )
+    return solution
+
+
+class _Problem(eqx.Module):
+    operator: AbstractOperator
+    conditions: Closure | None
+    reaction: Reaction
+    args: Any
+    rhs: Array
+
+    def field(self, v):
+        return v if self.conditions is None else self.conditions(v)
+
+    def residual(self, v):
+        """P (f - L u - r(u)) at u = E v + e."""
+        u = self.field(v)
+        left = self.rhs - self.operator(u) - self.reaction(u, self.args)
+        return left if self.conditions is None else self.conditions.restrict(left)
+
+    def slope(self, v):
+        """r'(u)."""
+        u = self.field(v)
+        return jax.jvp(lambda u: self.reaction(u, self.args), (u,), (jnp.ones_like(u),))[1]
+
+    def correction(self, v, residual, preconditioner, solver):
+        """The solution of (L + r') delta = residual; what it is linearised at is a constant."""
+        fixed, v = _constant((self, v))
+        operator, conditions = _shifted(fixed.operator, fixed.slope(v)), fixed.conditions
+        system = System.of(operator, conditions, preconditioner.incoming, v.dtype, False)
+        options = {"preconditioner": _constant(Inverse(preconditioner, system))}
+        return lx.linear_solve(system, residual, solver, options=options, throw=False)
+
+
+class _State(eqx.Module):
+    v: Array
+    residual: Array
+    size: Array
+    steps: Array
+    linear: Array
+    falls: Array
+
+
+@eqx.filter_jit
+def _solve(problem, u0, preconditioner, solver, rtol, atol, max_steps, throw):
+    fixed = _constant(problem)
+    loose = BiCGStab(_FORCING, 0.0, 1000) if solver is None else solver
+    tight = BiCGStab(min(rtol, 1e-8), 0.0, 1000) if solver is None else solver
+    start = fixed.residual(jax.lax.stop_gradient(u0))
+    size = jnp.linalg.norm(start)
+    source = jnp.linalg.norm(jnp.broadcast_to(fixed.rhs, u0.shape))
+    scale = jnp.maximum(size, source)
+    target = jnp.maximum(rtol * scale, atol)
+
+    def step(state):
+        found = fixed.correction(state.v, state.residual, preconditioner, loose)
+
+        def trial(t):
+            v = state.v + t * found.value
+            residual = fixed.residual(v)
+            return v, residual, jnp.linalg.norm(residual)
+
+        def too_long(search):
+            t, (_, _, size) = search
+            falls = size <= (1 - _ARMIJO * t) * state.size
+            return ~falls & (t > 0.5**_HALVINGS)
+
+        one = jnp.ones((), u0.dtype)
+        halve = lambda search: (search[0] / 2, trial(search[0] / 2))
+        _, (v, residual, size) = jax.lax.while_loop(too_long, halve, (one, trial(one)))
+        falls = size < state.size
+        keep = lambda new, old: jnp.where(falls, new, old)
+        linear = state.linear + found.stats["num_steps"]
+        return _State(
+            keep(v, state.v), keep(residual, state.residual), keep(size, state.size),
+            state.steps + 1, linear, falls,
+        )  # fmt: skip
+
+    zero = jnp.asarray(0)
+    state = _State(jax.lax.stop_gradient(u0), start, size, zero, zero, jnp.isfinite(size))
+    state = jax.lax.while_loop(
+        lambda s: s.falls & (s.size > target) & (s.steps < max_steps), step, state
+    )
+    result = optx.RESULTS.where(
+        state.steps >= max_steps,
+        optx.RESULTS.nonlinear_max_steps_reached,
+        optx.RESULTS.nonlinear_divergence,
+    )
+    result = optx.RESULTS.where(state.size <= target, optx.RESULTS.successful, result)
+    # One more Newton step has the derivative of the solution; its value is below the tolerance.
+    last = problem.correction(state.v, problem.residual(state.v), preconditioner, tight).value
+    u = problem.field(state.v + last - jax.lax.stop_gradient(last))
+    if throw:
+        u = eqx.error_if(
+            u,
+            result != optx.RESULTS.successful,
+            f"js.solve_nonlinear did not reach rtol = {rtol}, atol = {atol} in {max_steps} steps; "
+            "with throw=False, `result` says why and `stats` what was reached",
+        )
+    stats = {
+        "num_steps": state.steps,
+        "num_linear_steps": state.linear,
+        "relative_residual": state.size / jnp.where(scale > 0, scale, 1),
+    }
+    return optx.Solution(u, result, None, stats, None)
+
+
+def _constant(tree):
+    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.lax.stop_gradient(arrays), rest)
+
+
+def _shifted(operator, term):
+    return operator.shifted(term) if isinstance(operator, Stencil) else _Sum(operator, term)
+
+
+class _Sum(AbstractOperator):
+    """An operator plus a multiple of the identity that varies from point to point."""
+
+    operator: AbstractOperator
+    term: Array
+    in_shape = ()
+    out_shape = ()
+
+    @property
+    def n(self):
+        return self.operator.n
+
+    def __call__(self, u):
+        return self.operator(u) + self.term * u
+
+    def transpose(self):
+        return _Sum(self.operator.transpose(), self.term)
+
+    def to_scipy(self):
+        return (self.operator.to_scipy() + scipy.sparse.diags(np.asarray(self.term))).tocsr()

@@ -1,0 +1,441 @@
+"""Boundary conditions: exactness, order, stability, gradients, and what is refused."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.sparse
+import scipy.sparse.linalg
+
+import jaxsurf as js
+
+from .helpers import check_derivative
+
+A = jnp.array([0.9, -0.6, 0.5])
+
+
+def square(side, jitter=0.25, seed=0) -> js.PointCloud:
+    """A jittered grid on [-1, 1]²; its border stays."""
+    cloud = js.graph(lambda x, y: 0.0 * x, (side, side))
+    points, border = np.array(cloud.points), np.asarray(cloud.boundary)
+    step = np.random.default_rng(seed).uniform(-1, 1, (int((~border).sum()), 2))
+    points[~border, :2] += jitter * 2 / (side - 1) * step
+    return js.PointCloud(points, cloud.normals, boundary=border)
+
+
+def cap(n) -> js.PointCloud:
+    """The unit sphere within an angle of 1.3 of the south pole."""
+    return js.surface_of_revolution(lambda s: (jnp.sin(s), -jnp.cos(s)), n, interval=(0.0, 1.3))
+
+
+def cap_conormals(points):
+    up = jnp.array([0.0, 0.0, 1.0]) - points[:, 2:] * points
+    return up / jnp.linalg.norm(up, axis=1, keepdims=True)
+
+
+def annulus(n, seed=0) -> js.PointCloud:
+    """Rings between radius 0.4 and 1 in the plane, jittered inside, in random order."""
+    rng = np.random.default_rng(seed)
+    h = np.sqrt(np.pi * 0.84 / n)
+    radii = np.linspace(0.4, 1, round(0.6 / h) + 1)
+    points, border = [], []
+    for r in radii:
+        edge = r in (radii[0], radii[-1])
+        count = round(2 * np.pi * r / h)
+        angle = 2 * np.pi * np.arange(count) / count + rng.uniform(-0.2, 0.2, count) * h / r
+        ring = r * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        points.append(ring + (0 if edge else 0.2 * h) * rng.uniform(-1, 1, ring.shape))
+        border.append(np.full(count, edge))
+    order = rng.permutation(sum(map(len, points)))
+    flat = np.pad(np.concatenate(points), ((0, 0), (0, 1)))[order]
+    up = np.tile([0.0, 0.0, 1.0], (len(flat), 1))
+    return js.PointCloud(flat, up, boundary=np.concatenate(border)[order])
+
+
+def field(cloud, mean_curvature):
+    """u = exp(a·x) on a surface, its surface gradient and Laplacian."""
+    u, across = jnp.exp(cloud.points @ A), cloud.normals @ A
+    gradient = u[:, None] * (A - across[:, None] * cloud.normals)
+    return u, gradient, u * (A @ A - across**2 - 2 * mean_curvature * across)
+
+
+def condition(kind, cloud, u, gradient):
+    border = cloud.boundary
+    flux = jnp.sum(gradient[border] * js.border_conormals(cloud), axis=1)
+    if kind == "dirichlet":
+        return js.dirichlet(border, u[border])
+    if kind == "neumann":
+        return js.neumann(border, flux)
+    return js.robin(border, 2 * u[border] + flux, a=2.0, b=1.0)
+
+
+def reduced(laplacian, closure, shift=0.0):
+    """P (A - shift) E on the free points, and P A e."""
+    free = ~np.asarray(closure.bound)
+    matrix = laplacian.to_scipy() - shift * scipy.sparse.eye(laplacian.n)
+    inner = (matrix @ closure.to_scipy())[free][:, free]
+    return inner.tocsc(), (matrix @ np.asarray(closure.offset()))[free], free
+
+
+def poisson_error(cloud, laplacian, closure, u, rhs, shift):
+    """Largest error of (Δ - shift) u = rhs, relative to the largest value."""
+    matrix, offset, free = reduced(laplacian, closure, shift)
+    rhs = np.pad(np.asarray(rhs - shift * u), (0, laplacian.n - cloud.n))[free]
+    found = scipy.sparse.linalg.spsolve(matrix, rhs - offset)
+    exact = np.pad(np.asarray(u), (0, laplacian.n - cloud.n))[free]
+    return np.abs(found - exact).max() / np.abs(exact).max()
+
+
+def one_sided(cloud, conditions, method):
+    closure = js.close(cloud, conditions, method=method)
+    neighbors = js.choose_neighbors(cloud, method=method, bound=closure.bound)
+    return js.laplace_beltrami(cloud, neighbors, method=method), closure
+
+
+def mirrored(cloud, conditions, method):
+    wide, closure = js.with_ghosts(cloud, conditions, method=method)
+    neighbors = js.choose_neighbors(wide, method=method, bound=closure.bound)
+    return js.laplace_beltrami(wide, neighbors, method=method), closure
+
+
+# --- the closure ---------------------------------------------------------------------------
+
+
+def test_bound_values_of_polynomials_are_exact():
+    cloud = square(11)
+    x, y = cloud.points[:, 0], cloud.points[:, 1]
+    u = 3 * x**2 - x * y + 2 * y**2 + x - 1
+    gradient = jnp.stack([6 * x - y + 1, 4 * y - x, 0 * x], axis=1)
+    for kind in ("dirichlet", "neumann", "robin"):
+        for method in (js.GFDM(degree=2), js.DCPSE(order=2)):
+            closure = js.close(cloud, condition(kind, cloud, u, gradient), method=method)
+            wrong = jnp.where(cloud.boundary, jnp.nan, u)  # bound values are not looked at
+            np.testing.assert_allclose(closure(wrong), u, atol=1e-10)
+
+
+def test_the_parts_of_a_closure_agree():
+    cloud = square(9)
+    x = np.asarray(cloud.points)
+    left = np.abs(x[:, 0] + 1) < 1e-9
+    rest = np.asarray(cloud.boundary) & ~left
+    inner = [int(np.argmin(np.abs(x).sum(axis=1)))]
+    closure = js.close(
+        cloud,
+        [
+            js.dirichlet(left, lambda t: jnp.sin(t)),
+            js.neumann(rest, 0.3),
+            js.dirichlet(inner, 2.0),
+        ],
+    )
+    u = jnp.asarray(np.random.default_rng(0).normal(size=cloud.n))
+    t = 0.7
+    full = closure(u, t)
+    assert closure.m == int(np.asarray(cloud.boundary).sum()) + 1
+    np.testing.assert_allclose(full[left], np.sin(t), atol=1e-15)
+    assert full[inner[0]] == 2.0
+    np.testing.assert_allclose(closure.homogeneous(u) + closure.offset(t), full, atol=1e-14)
+    np.testing.assert_allclose(
+        closure.to_scipy() @ np.asarray(u), closure.homogeneous(u), atol=1e-14
+    )
+    np.testing.assert_allclose(closure.stencil(u), closure.homogeneous(u), atol=1e-14)
+    np.testing.assert_allclose(closure(full, t), full, atol=1e-14)  # E² = E
+    linear = eqx.filter_jit(lambda c, u: c.homogeneous(u))(closure, u)
+    np.testing.assert_allclose(linear, closure.homogeneous(u), atol=1e-14)
+    filled = eqx.filter_jit(lambda c, u, t: c(u, t))(closure, u, t)
+    np.testing.assert_allclose(filled, full, atol=1e-14)
+    two = closure(jnp.stack([u, 3 * u], axis=1), t)
+    np.testing.assert_allclose(two[:, 0], full, atol=1e-14)
+    assert not closure.restrict(u)[closure.bound].any()
+
+
+def test_values_per_component():
+    cloud = square(7)
+    value = jnp.array([[1.0, 2.0]])
+    border = jnp.flatnonzero(cloud.boundary)
+    values = jnp.tile(value, (len(border), 1))
+    closure = js.close(cloud, js.dirichlet(border, values))
+    filled = closure(jnp.zeros((cloud.n, 2)))
+    np.testing.assert_array_equal(filled[border], values)
+    with pytest.raises(ValueError, match="the field has none"):
+        closure(jnp.zeros(cloud.n))
+
+
+def test_great_circle_and_single_points():
+    cloud = js.sphere(800)
+    circle = jnp.abs(cloud.points[:, 0]) < 0.04
+    u, _, lap = field(cloud, 1.0)
+    closure = js.close(cloud, js.dirichlet(circle, u[circle]))
+    laplacian = js.laplace_beltrami(cloud, method=js.GFDM(degree=4))
+    assert poisson_error(cloud, laplacian, closure, u, lap, 0.0) < 2e-5
+    closure = js.close(cloud, js.dirichlet([5], u[5:6]))
+    assert poisson_error(cloud, laplacian, closure, u, lap, 0.0) < 4e-4
+
+
+def test_ends_of_a_curve():
+    for side in (1.0, -1.0):
+        angle = jnp.linspace(0.2, 2.0, 60)
+        points = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+        border = jnp.zeros(60, bool).at[jnp.array([0, 59])].set(True)
+        cloud = js.PointCloud(points, side * points, boundary=border)
+        exact = jnp.array([[jnp.sin(0.2), -jnp.cos(0.2)], [-jnp.sin(2.0), jnp.cos(2.0)]])
+        np.testing.assert_allclose(js.border_conormals(cloud), exact, atol=1e-14)
+        np.testing.assert_array_equal(js.detect_border(cloud), border)
+        conditions = js.neumann(border, jnp.array([jnp.sin(0.4), -jnp.sin(4.0)]) * 2)
+        laplacian, closure = one_sided(cloud, conditions, js.GFDM(degree=4))
+        u = jnp.cos(2 * angle)
+        assert poisson_error(cloud, laplacian, closure, u, -4 * u, 1.0) < 1e-6
+        laplacian, closure = mirrored(cloud, conditions, js.GFDM(degree=2))
+        assert poisson_error(cloud, laplacian, closure, u, -4 * u, 1.0) < 2e-3
+
+
+# --- accuracy ------------------------------------------------------------------------------
+
+# Method, kind, largest errors on the cap with 400 and 1,600 points, and the least slope.
+ONE_SIDED = [
+    (js.GFDM(degree=2), "neumann", 3e-3, 1.8),
+    (js.GFDM(degree=2), "robin", 1e-3, 1.8),
+    (js.GFDM(degree=4), "dirichlet", 1e-6, 3.8),
+    (js.GFDM(degree=4), "neumann", 2e-5, 3.8),
+    (js.DCPSE(order=2), "neumann", 3e-3, 1.8),
+    (js.DCPSE(order=4), "neumann", 2e-5, 3.8),
+]
+
+
+@pytest.mark.parametrize(("method", "kind", "bound", "least"), ONE_SIDED)
+def test_poisson_with_one_sided_stencils(method, kind, bound, least):
+    errors = []
+    for n in (400, 1600):
+        cloud = cap(n)
+        u, gradient, lap = field(cloud, jnp.sign(jnp.sum(cloud.points * cloud.normals, axis=1)))
+        laplacian, closure = one_sided(cloud, condition(kind, cloud, u, gradient), method)
+        shift = 0.0 if kind == "dirichlet" else 1.0
+        errors.append(poisson_error(cloud, laplacian, closure, u, lap, shift))
+    assert errors[-1] < bound
+    assert np.log2(errors[0] / errors[1]) > least
+
+
+@pytest.mark.parametrize("kind", ["dirichlet", "neumann", "robin"])
+@pytest.mark.parametrize("make", [square, cap, annulus], ids=lambda f: f.__name__)
+def test_poisson_with_ghosts(make, kind):
+    errors = []
+    for n in (400, 1600):
+        cloud = make(round(n**0.5)) if make is square else make(n)
+        curvature = jnp.sign(jnp.sum(cloud.points * cloud.normals, axis=1)) if make is cap else 0
+        u, gradient, lap = field(cloud, curvature)
+        conditions = condition(kind, cloud, u, gradient)
+        laplacian, closure = mirrored(cloud, conditions, js.GFDM(degree=2))
+        shift = 0.0 if kind == "dirichlet" else 1.0
+        errors.append(poisson_error(cloud, laplacian, closure, u, lap, shift))
+    assert errors[-1] < 3e-3
+    assert np.log2(errors[0] / errors[1]) > 1.5
+
+
+def test_even_and_odd_images_of_symmetric_fields():
+    cloud = square(11)
+    x, y = cloud.points[:, 0], cloud.points[:, 1]
+    wide, closure = js.with_ghosts(cloud, js.neumann(cloud.boundary))
+    np.testing.assert_array_equal(wide.points[: cloud.n], cloud.points)
+    np.testing.assert_array_equal(wide.boundary, jnp.arange(wide.n) >= cloud.n)
+    exact = lambda p: jnp.cos(jnp.pi * p[:, 0]) * jnp.cos(2 * jnp.pi * p[:, 1])
+    np.testing.assert_allclose(closure.extend(exact(cloud.points)), exact(wide.points), atol=1e-11)
+    wide, closure = js.with_ghosts(cloud, js.dirichlet(cloud.boundary, 1.5))
+    exact = lambda p: 1.5 + jnp.sin(jnp.pi * p[:, 0]) * jnp.sin(2 * jnp.pi * p[:, 1])
+    np.testing.assert_allclose(closure.extend(exact(cloud.points)), exact(wide.points), atol=1e-11)
+    # Even in x, odd in y, with images of images beyond the corners.
+    sides = np.abs(np.abs(x) - 1) < 1e-9
+    rest = np.asarray(cloud.boundary) & ~(sides & (np.abs(y) < 1 - 1e-9))
+    both = [js.dirichlet(rest), js.neumann(np.asarray(cloud.boundary) & ~rest)]
+    wide, closure = js.with_ghosts(cloud, both)
+    exact = lambda p: jnp.cos(jnp.pi * p[:, 0]) * jnp.sin(jnp.pi * p[:, 1])
+    beyond = jnp.all(jnp.abs(wide.points[:, :2]) > 1, axis=1)
+    assert beyond.sum() > 4
+    np.testing.assert_allclose(closure.extend(exact(cloud.points)), exact(wide.points), atol=1e-11)
+
+
+def test_images_of_a_sphere_lie_on_it():
+    cloud = cap(600)
+    wide, _ = js.with_ghosts(cloud, js.neumann(cloud.boundary), depth=0.3)
+    assert wide.n > cloud.n + 100
+    np.testing.assert_allclose(jnp.linalg.norm(wide.points, axis=1), 1, atol=1e-13)
+    side = jnp.sum(wide.points * wide.normals, axis=1)
+    np.testing.assert_allclose(side, side[0], atol=1e-13)
+    spacing = js.measure_quality(wide).min_distance if hasattr(js, "measure_quality") else None
+    assert spacing is None or spacing > 0
+
+
+# --- stability -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["dirichlet", "neumann"])
+@pytest.mark.parametrize("way", [one_sided, mirrored], ids=lambda f: f.__name__)
+@pytest.mark.parametrize("make", [square, annulus], ids=lambda f: f.__name__)
+@pytest.mark.parametrize("method", [js.GFDM(degree=2), js.GFDM(degree=4), js.DCPSE(order=4)])
+def test_no_growing_modes(make, way, kind, method):
+    cloud = make(17) if make is square else make(350)
+    at_rest = js.dirichlet if kind == "dirichlet" else js.neumann
+    laplacian, closure = way(cloud, at_rest(cloud.boundary), method)
+    values = np.linalg.eigvals(reduced(laplacian, closure)[0].toarray())
+    assert values.real.max() < 1e-8 * np.abs(values).max()
+
+
+# --- derivatives ---------------------------------------------------------------------------
+
+SMALL = square(9, jitter=0.2)
+BORDER = js.find_border(SMALL)
+NEAR = js.find_neighbors(SMALL, k=40)
+PROBE = jnp.asarray(np.random.default_rng(1).normal(size=SMALL.n))
+U = jnp.asarray(np.random.default_rng(2).normal(size=SMALL.n))
+FLUX = jnp.asarray(np.random.default_rng(3).normal(size=BORDER.points.shape))
+
+
+def closed_value(points=SMALL.points, value=FLUX, a=0.5, b=1.0, u=U):
+    cloud = js.PointCloud(points, SMALL.normals)
+    here = np.asarray(SMALL.boundary)
+    conditions = js.robin(here, value, a=a, b=b)
+    return PROBE @ js.close(cloud, conditions, neighbors=NEAR, border=BORDER)(u)
+
+
+@pytest.mark.parametrize("what", ["points", "value", "a", "b", "u"])
+def test_derivatives_of_the_closure(what):
+    start = dict(points=SMALL.points, value=FLUX, a=0.5 + 0 * FLUX, b=1 + 0 * FLUX, u=U)[what]
+    check_derivative(lambda x: closed_value(**{what: x}), start)
+
+
+def test_derivatives_of_images():
+    def f(x):
+        a, b, g = x
+        _, closure = js.with_ghosts(SMALL, js.robin(SMALL.boundary, g, a=a, b=b), border=BORDER)
+        filled = closure.extend(U)
+        return jnp.sum(jnp.sin(jnp.arange(len(filled))) * filled)
+
+    check_derivative(f, jnp.stack([0.5 + 0 * FLUX, 1 + 0 * FLUX, FLUX]))
+
+
+# --- borders -------------------------------------------------------------------------------
+
+
+def test_conormals():
+    errors = []
+    for n in (500, 2000):
+        cloud = annulus(n)
+        p = cloud.points[cloud.boundary]
+        r = jnp.linalg.norm(p, axis=1, keepdims=True)
+        exact = jnp.where(r > 0.7, p / r, -p / r)
+        errors.append(float(jnp.abs(js.border_conormals(cloud) - exact).max()))
+    assert errors[1] < 5e-6
+    assert errors[0] / errors[1] > 2**3.5
+    sphere_cap = cap(500)
+    exact = cap_conormals(sphere_cap.points[sphere_cap.boundary])
+    np.testing.assert_allclose(js.border_conormals(sphere_cap), exact, atol=1e-13)
+    flat = square(9)
+    border = js.find_border(flat)
+    assert int(border.corners.sum()) == 4
+    p = flat.points[flat.boundary]
+    exact = jnp.where(jnp.abs(jnp.abs(p) - 1) < 1e-9, jnp.sign(p), 0)
+    exact = exact / jnp.linalg.norm(exact, axis=1, keepdims=True)
+    np.testing.assert_allclose(js.border_conormals(flat), exact, atol=1e-13)
+
+
+@pytest.mark.parametrize("make", [lambda: square(17, 0.35), lambda: cap(700), lambda: annulus(900)])
+def test_borders_are_detected(make):
+    cloud = make()
+    np.testing.assert_array_equal(js.detect_border(cloud), cloud.boundary)
+    assert not js.detect_border(js.sphere(700)).any()
+
+
+def test_conormals_of_a_mesh():
+    # A fan around the pole of the unit sphere.
+    rings, count = 6, 24
+    theta = 1.1 * jnp.arange(1, rings + 1) / rings
+    phi = 2 * jnp.pi * jnp.arange(count) / count
+    t, p = (x.ravel() for x in jnp.meshgrid(theta, phi, indexing="ij"))
+    points = jnp.stack([jnp.sin(t) * jnp.cos(p), jnp.sin(t) * jnp.sin(p), jnp.cos(t)], axis=1)
+    points = jnp.concatenate([jnp.array([[0.0, 0.0, 1.0]]), points])
+    at = lambda i, j: 1 + i * count + j % count
+    triangles = [(0, at(0, j), at(0, j + 1)) for j in range(count)]
+    for i in range(rings - 1):
+        for j in range(count):
+            triangles += [(at(i, j), at(i + 1, j), at(i + 1, j + 1))]
+            triangles += [(at(i, j), at(i + 1, j + 1), at(i, j + 1))]
+    mesh = js.TriangleMesh(np.asarray(points), np.array(triangles))
+    cloud = js.PointCloud(points, points, boundary=mesh.border_vertices)
+    border = js.find_border(cloud, mesh)
+    outward = -cap_conormals(points[cloud.boundary])
+    np.testing.assert_allclose(js.border_conormals(cloud, border), outward, atol=1e-12)
+    np.testing.assert_allclose(js.border_conormals(cloud), outward, atol=1e-12)
+    with pytest.raises(ValueError, match="145 vertices, the cloud 50"):
+        js.find_border(js.sphere(50), mesh)
+
+
+# --- what is refused -----------------------------------------------------------------------
+
+
+def test_bad_conditions():
+    cloud = square(9)
+    border = np.flatnonzero(np.asarray(cloud.boundary))
+    inner = np.flatnonzero(~np.asarray(cloud.boundary))
+    bad = [
+        ([js.dirichlet(border, 0.0), js.dirichlet(border[3:], 1.0)], f"point {border[3]} is bound"),
+        ([js.dirichlet(border), js.neumann(border[-1:])], f"point {border[-1]} is bound"),
+        (js.neumann(inner[:1]), f"no conormal at point {inner[0]}"),
+        (js.dirichlet([90]), "names point 90, there are 81"),
+        ([], "no conditions"),
+        (js.dirichlet(np.ones(81, bool)), "all 81 points are bound"),
+        (js.robin(border, a=-1e9, b=0.0), None),
+        (js.robin(border, a=0.0, b=0.0), "does not determine the value at point"),
+    ]
+    for conditions, message in bad:
+        if message is None:
+            js.close(cloud, conditions)
+            continue
+        with pytest.raises(ValueError, match=message):
+            js.close(cloud, conditions)
+    same = js.close(cloud, [js.dirichlet(border, 1.0), js.dirichlet(border[3:], 1.0)])
+    assert same.m == len(border)
+    with pytest.raises(ValueError, match="named 2 times"):
+        js.dirichlet([3, 3])
+    with pytest.raises(ValueError, match="value has shape"):
+        js.dirichlet([3, 4], jnp.zeros(3))
+    with pytest.raises(ValueError, match="must be concrete"):
+        jax.jit(lambda m: js.dirichlet(m).m)(cloud.boundary)
+    with pytest.raises(ValueError, match="no point is marked"):
+        js.find_border(js.sphere(50))
+    off = js.PointCloud(cloud.points, cloud.normals, active=jnp.arange(81) != border[0])
+    with pytest.raises(ValueError, match=f"names point {border[0]}, which is switched off"):
+        js.close(off, js.dirichlet(border))
+
+
+def test_a_robin_condition_of_the_wrong_sign():
+    cloud = square(9)
+    near = js.find_neighbors(cloud, k=40)
+    border = js.find_border(cloud)
+    closure = js.close(cloud, js.neumann(cloud.boundary), neighbors=near, border=border)
+    pivot = 1 / closure.sources[0].factor  # w_i, as a = 0 and b = 1
+    conditions = js.robin(cloud.boundary, a=-pivot, b=1.0)
+    with pytest.raises(ValueError, match=r"does not determine the value at point \d+: a \+ b w_i"):
+        js.close(cloud, conditions, neighbors=near)
+
+
+def test_too_few_free_neighbours():
+    cloud = square(9)
+    near = js.find_neighbors(cloud, k=8)
+    message = r"point \d+ has \d free neighbours, GFDM.* needs at least 5 besides the point itself"
+    with pytest.raises(ValueError, match=message):
+        js.close(cloud, js.neumann(cloud.boundary), neighbors=near)
+
+
+def test_bad_ghosts():
+    cloud = square(9)
+    inner = int(np.flatnonzero(~np.asarray(cloud.boundary))[0])
+    normal = jnp.array([[1.0, 0.0, 0.0]])
+    with pytest.raises(
+        ValueError, match=f"derivative at point {inner}, which is not on the border"
+    ):
+        js.with_ghosts(cloud, js.neumann([inner], conormals=normal))
+    with pytest.raises(ValueError, match="nothing to reflect"):
+        js.with_ghosts(cloud, js.dirichlet([inner]))
+    with pytest.raises(ValueError, match="depth = -1"):
+        js.with_ghosts(cloud, js.neumann(cloud.boundary), depth=-1.0)
+    with pytest.raises(ValueError, match="does not determine the image"):
+        js.with_ghosts(cloud, js.robin(cloud.boundary, a=0.0, b=0.0))

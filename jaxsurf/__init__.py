@@ -80,11 +80,11 @@ from .stencils.method import Diagnostics as Diagnostics
 from .stencils.stencil import AbstractOperator as AbstractOperator
 from .stencils.stencil import Composition as Composition
 from .stencils.stencil import Stencil as Stencil
+from .time.checkpoint import Checkpoint as Checkpoint
 from .time.explicit import RKC2 as RKC2
 from .time.implicit import IMEX as IMEX
 from .time.implicit import SDIRK as SDIRK
 from .time.integrate import IntegrationError as IntegrationError
-from .time.integrate import choose_solver as choose_solver
 from .time.integrate import integrate as integrate
 from .time.integrate import steady_state as steady_state
 from .time.pde import AbstractEvolution as AbstractEvolution
@@ -92,6 +92,7 @@ from .time.pde import AdvectionDiffusionReaction as AdvectionDiffusionReaction
 from .time.pde import BiharmonicDiffusion as BiharmonicDiffusion
 from .time.pde import CahnHilliard as CahnHilliard
 from .time.pde import WaveEquation as WaveEquation
+from .time.run import choose_solver as choose_solver
 from .time.stabilize import hyperviscosity as hyperviscosity
 from .time.stabilize import upwinding as upwinding
 

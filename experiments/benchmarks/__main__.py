@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 from tqdm import tqdm
 
-from . import cases
+from . import cases, heat
 
 # Measured on a 2-core machine of the same kind, one process each: build s and apply ms at 1e5.
 PEERS = {
@@ -41,7 +41,7 @@ def plan(quick: bool) -> list[tuple[str, list]]:
         for name in cases.METHODS
         for reverse in (False, True)
     ]
-    return [*todo, ("retraces", [])]
+    return [*todo, ("retraces", []), *heat.plan(quick)]
 
 
 def run_case(name: str, arguments: list) -> dict:
@@ -118,7 +118,9 @@ def main() -> None:
     if options.case:
         jax.config.update("jax_enable_x64", True)
         name, arguments = options.case
-        print(json.dumps(getattr(cases, name)(*json.loads(arguments))))
+        module, _, function = name.rpartition(".")
+        case = getattr({"": cases, "heat": heat}[module], function)
+        print(json.dumps(case(*json.loads(arguments))))
         return
     results = []
     for name, arguments in tqdm(plan(options.quick), desc="benchmarks", unit="case"):

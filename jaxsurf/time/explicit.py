@@ -2,19 +2,17 @@ r"""Runge–Kutta–Chebyshev: explicit steps whose stable length grows with the
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
-# Damping of the stability polynomial: the strip around the negative real axis that it covers.
-_DAMPING = 2 / 13
+from .chebyshev import Loop, last_stage
+
 # Steps between two estimates of the spectral radius, applications in the first and in later ones.
 _REFRESH, _FIRST, _LATER = 25, 20, 4
 # A power iteration sees the radius from below.
@@ -79,7 +77,7 @@ class RKC2(dfx.AbstractAdaptiveSolver):
 
     spectral_radius: ArrayLike | None = None
     max_stages: int = eqx.field(static=True, default=200)
-    loop: Literal["checkpointed", "lax", "bounded"] = eqx.field(static=True, default="checkpointed")
+    loop: Loop = eqx.field(static=True, default="checkpointed")
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar = dfx.ThirdOrderHermitePolynomialInterpolation
@@ -124,7 +122,7 @@ class RKC2(dfx.AbstractAdaptiveSolver):
         def increment(fraction, y):
             return terms.vf_prod(t0 + fraction * (t1 - t0), y, args, span)
 
-        y1 = _chebyshev(increment, y0, k0, stages, self.max_stages, self.loop)
+        y1 = last_stage(increment, y0, k0, stages, max_stages=self.max_stages, loop=self.loop)
         rate = terms.vf(t1, y1, args)
         k1 = terms.prod(rate, span)
         error = jax.tree.map(lambda a, b, p, q: 0.8 * (a - b) + 0.4 * (p + q), y0, y1, k0, k1)
@@ -142,58 +140,6 @@ class RKC2(dfx.AbstractAdaptiveSolver):
             return state._replace(radius=radius, direction=direction, age=jnp.zeros_like(state.age))
 
         return jax.lax.cond(state.age < _REFRESH, lambda: state, again)
-
-
-def _chebyshev(
-    increment: Callable, y0: PyTree[Array], k0: PyTree[Array], stages, max_stages: int, loop
-) -> PyTree[Array]:
-    r"""The stages $Y_0, \dots, Y_s$ of one step (eqs. 2.4 to 2.6); returns the last.
-
-    Args:
-        increment: (c, y) -> Δt times the right-hand side at t + c Δt.
-        y0, k0: the state, and its increment.
-    """
-    dtype = jnp.result_type(*jax.tree.leaves(y0))
-    s2 = stages.astype(dtype) ** 2
-    w0 = 1 + _DAMPING / s2
-    # T_s and its derivatives at w0 = cosh(angle).
-    angle = jnp.arccosh(w0)
-    sinh2 = w0**2 - 1
-    s = jnp.sqrt(s2)
-    first = s * jnp.sinh(s * angle) / jnp.sqrt(sinh2)
-    second = (s2 * jnp.cosh(s * angle) - w0 * first) / sinh2
-    w1 = first / second
-
-    # Chebyshev polynomials and two derivatives, of degrees j - 1 and j - 2.
-    zero, one = jnp.zeros_like(w0), jnp.ones_like(w0)
-    polynomials = jnp.stack([w0, one, zero]), jnp.stack([one, zero, zero])
-    b = 1 / (4 * w0**2)
-    y1 = jax.tree.map(lambda y, k: y + b * w1 * k, y0, k0)
-
-    def unfinished(carry):
-        return carry[0] <= stages
-
-    def stage(carry):
-        j, (last, before), (b_last, b_before), c, (y_last, y_before) = carry
-        chain = jnp.stack([zero, 2 * last[0], 4 * last[1]])
-        now = 2 * w0 * last - before + chain
-        b_now = now[2] / now[1] ** 2
-        mu = 2 * b_now * w0 / b_last
-        nu = -b_now / b_before
-        mu_k = 2 * b_now * w1 / b_last
-        gamma_k = -(1 - b_last * last[0]) * mu_k
-        k = increment(c, y_last)
-        y = jax.tree.map(
-            lambda y0, y_last, y_before, k, k0: (
-                (1 - mu - nu) * y0 + mu * y_last + nu * y_before + mu_k * k + gamma_k * k0
-            ),
-            y0, y_last, y_before, k, k0,
-        )  # fmt: skip
-        return j + 1, (now, last), (b_now, b_last), w1 * now[2] / now[1], (y, y_last)
-
-    c1 = w1 * (1 / w0) / (4 * w0)  # c_2 / T_2'(w0), with c_2 = w1 T_2'' / T_2'
-    carry = (jnp.asarray(2, stages.dtype), polynomials, (b, b), c1, (y1, y0))
-    return eqxi.while_loop(unfinished, stage, carry, max_steps=max_stages, kind=loop)[-1][0]
 
 
 def _power(terms, t, y, args, rate, direction, count: int):

@@ -2,37 +2,22 @@ r"""One call from a problem and a state to a solution in time."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, PyTree
 
-from ..cloud import is_concrete, raise_at
-from .explicit import RKC2
-from .implicit import IMEX
-from .pde import (
-    AbstractEvolution,
-    AdvectionDiffusionReaction,
-    BiharmonicDiffusion,
-    CahnHilliard,
-    WaveEquation,
-)
+from .checkpoint import Checkpoint, integrate_in_parts
+from .pde import AbstractEvolution
+from .run import Run
 
-_log = logging.getLogger(__name__)
-
-# Copies of the state kept for the reverse pass.
-_CHECKPOINTS = 64
 # Steps that are allowed when the number that are stored does not grow with it, and otherwise.
 _MANY_STEPS, _STORED_STEPS = 10_000_000, 4096
-# A step this much shorter than the whole interval means that something diverges.
-_SHORTEST = 1e-11
 
 
 class IntegrationError(RuntimeError):
@@ -50,37 +35,6 @@ class IntegrationError(RuntimeError):
         self.solution, self.time, self.state = solution, time, state
 
 
-def choose_solver(problem: AbstractEvolution) -> tuple[dfx.AbstractSolver, str]:
-    """A solver that suits the kind of problem, and why.
-
-    Only the kind counts, not the values, so that the choice is the same under `jit` and
-    `grad`. Reactions faster than diffusion on the smallest scale call for `SDIRK`, which is
-    yours to pass.
-
-    Args:
-        problem: what is to be integrated.
-
-    Returns:
-        The solver and a sentence.
-
-    Example:
-        >>> js.choose_solver(js.WaveEquation(js.laplace_beltrami(js.sphere(500))))[1]
-        'Tsit5: waves are not stiff'
-    """
-    if isinstance(problem, WaveEquation):
-        return dfx.Tsit5(), "Tsit5: waves are not stiff"
-    if isinstance(problem, BiharmonicDiffusion | CahnHilliard):
-        return IMEX(order=3), "IMEX(order=3): fourth order in space is too stiff for explicit steps"
-    if isinstance(problem, AdvectionDiffusionReaction):
-        moving = problem.advection is not None or problem.velocity is not None
-        if problem.laplacian is None:
-            return dfx.Tsit5(), "Tsit5: advection is not stiff"
-        if moving:
-            return IMEX(order=3), "IMEX(order=3): advection explicit, diffusion implicit"
-        return RKC2(), "RKC2: diffusion, by explicit steps with many stages"
-    return IMEX(order=3), "IMEX(order=3): a linear part of unknown stiffness"
-
-
 def integrate(
     problem: AbstractEvolution,
     u0: PyTree[Array],
@@ -96,6 +50,7 @@ def integrate(
     event: dfx.Event | None = None,
     progress: bool = False,
     adjoint: dfx.AbstractAdjoint | None = None,
+    checkpoint: Checkpoint | None = None,
     args: Any = None,
     max_steps: int | None = None,
     throw: bool = True,
@@ -119,6 +74,7 @@ def integrate(
         progress: show a progress bar.
         adjoint: how to differentiate; by default reverse mode with 64 copies of the state
             however many the steps. `diffrax.ForwardMode()` for forward mode.
+        checkpoint: a file to write every so many steps, and to go on from: see `Checkpoint`.
         args: handed to reactions and forcings.
         max_steps: by default ten million, or 4,096 where every step is stored.
         throw: raise if the end is not reached; if False, see `Solution.result`.
@@ -145,12 +101,14 @@ def integrate(
         >>> bool(jnp.abs(solution.ys[-1] - jnp.exp(-1.0) * cloud.points[:, 2]).max() < 0.01)
         True
     """
-    run = _Run.of(problem, u0, t0, t1, solver, dt0, rtol, atol, controller, adjoint, args)
+    run = Run.of(problem, u0, t0, t1, solver, dt0, rtol, atol, controller, adjoint, args)
     saveat = dfx.SaveAt(t1=True) if saveat is None else saveat
     if max_steps is None:
         max_steps = _STORED_STEPS if _stores_steps(saveat) else _MANY_STEPS
-    with_last = _closed_saves(saveat, run.problem)
-    raised_later = throw and not run.concrete
+    if checkpoint is not None:
+        saveat = _closed(saveat, run.problem)
+        solution = integrate_in_parts(run, checkpoint, saveat, event, max_steps, progress)
+        return _finished(run, solution, throw)
     solution = dfx.diffeqsolve(
         run.terms,
         run.solver,
@@ -159,12 +117,12 @@ def integrate(
         run.dt0,
         run.u0,
         args,
-        saveat=with_last,
+        saveat=_with_last(_closed(saveat, run.problem), run.problem),
         stepsize_controller=run.controller,
         adjoint=run.adjoint,
         event=event,
         max_steps=max_steps,
-        throw=raised_later,
+        throw=throw and not run.concrete,
         progress_meter=dfx.TqdmProgressMeter() if progress else dfx.NoProgressMeter(),
     )
     return _finished(run, solution, throw)
@@ -185,102 +143,6 @@ def steady_state(*, rtol: float = 1e-4, atol: float = 1e-6) -> dfx.Event:
         True
     """
     return dfx.Event(dfx.steady_state_event(rtol, atol, optx.rms_norm))
-
-
-# --- what a run consists of ----------------------------------------------------------------
-
-
-class _Run(eqx.Module):
-    """Everything `diffeqsolve` takes, checked and in one precision."""
-
-    problem: AbstractEvolution
-    terms: PyTree
-    solver: dfx.AbstractSolver
-    why: str = eqx.field(static=True)
-    t0: Array
-    t1: Array
-    dt0: Array | None
-    u0: PyTree[Array]
-    controller: dfx.AbstractStepSizeController
-    adjoint: dfx.AbstractAdjoint
-    concrete: bool = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, problem, u0, t0, t1, solver, dt0, rtol, atol, controller, adjoint, args) -> _Run:
-        u0 = jax.tree.map(_as_float, u0)
-        real = jnp.finfo(jnp.result_type(*jax.tree.leaves(u0))).dtype
-        t0, t1 = jnp.asarray(t0, real), jnp.asarray(t1, real)
-        dt0 = None if dt0 is None else jnp.asarray(dt0, real)
-        leaves = jax.tree.leaves((problem, u0, t0, t1, args))
-        concrete = is_concrete(*leaves)
-        if is_concrete(t0, t1, dt0):
-            _check_times(t0, t1, dt0)
-        if concrete:
-            _check_state(problem, t0, u0, args)
-        why = "given"
-        if solver is None:
-            solver, why = choose_solver(problem)
-        adjoint = dfx.RecursiveCheckpointAdjoint(_CHECKPOINTS) if adjoint is None else adjoint
-        if isinstance(solver, RKC2):
-            solver = _looped(solver, adjoint)
-        if controller is None and dt0 is None:
-            shortest = _SHORTEST * jnp.abs(t1 - t0)
-            controller = dfx.PIDController(rtol, atol, dtmin=shortest, force_dtmin=False)
-        elif controller is None:
-            controller = dfx.ConstantStepSize()
-        if not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
-            controller = Guarded(controller)
-        _log.info("%s over [%s, %s] by %s", type(problem).__name__, t0, t1, why)
-        return cls(
-            problem, _terms(problem, solver), solver, why, t0, t1, dt0,
-            u0, controller, adjoint, concrete,
-        )  # fmt: skip
-
-
-def _terms(problem: AbstractEvolution, solver: dfx.AbstractSolver):
-    """The right-hand side, in two parts for solvers that treat them differently."""
-    if not _takes_two(solver):
-        return dfx.ODETerm(problem.rate)
-    return dfx.MultiTerm(dfx.ODETerm(problem.explicit_rate), dfx.ODETerm(problem.implicit_rate))
-
-
-def _takes_two(solver: dfx.AbstractSolver) -> bool:
-    return getattr(solver.term_structure, "__origin__", None) is dfx.MultiTerm
-
-
-def _looped(solver: RKC2, adjoint: dfx.AbstractAdjoint) -> RKC2:
-    """With the kind of loop that the adjoint can differentiate."""
-    loop: Literal["checkpointed", "lax", "bounded"] = "checkpointed"
-    if isinstance(adjoint, dfx.ForwardMode):
-        loop = "lax"
-    elif isinstance(adjoint, dfx.DirectAdjoint):
-        loop = "bounded"
-    return RKC2(solver.spectral_radius, solver.max_stages, loop)
-
-
-class Guarded(dfx.AbstractStepSizeController):
-    """A controller of given steps that never accepts a state with entries that are not finite.
-
-    It stops there with a result code, and the state before stays. (An adaptive controller
-    refuses and shortens such steps by itself.)
-    """
-
-    controller: dfx.AbstractStepSizeController
-
-    def wrap(self, direction):
-        return Guarded(self.controller.wrap(direction))
-
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state):
-        keep, start, end, jump, new_state, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, state
-        )
-        leaves = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(y1_candidate)]
-        finite = jnp.all(jnp.stack(leaves))
-        result = dfx.RESULTS.where(finite, result, dfx.RESULTS.nonlinear_divergence)
-        return keep & finite, jnp.where(finite, start, t0), end, jump, new_state, result
 
 
 # --- saving, closing, reporting ------------------------------------------------------------
@@ -312,18 +174,23 @@ def _state(t, y, args):
     return y
 
 
-def _closed_saves(saveat: dfx.SaveAt, problem: AbstractEvolution) -> dfx.SaveAt:
-    """The same saves with boundary values filled in, and the last state in any case."""
+def _closed(saveat: dfx.SaveAt, problem: AbstractEvolution) -> dfx.SaveAt:
+    """The same saves with boundary values filled in."""
 
     def closed(sub):
         return eqx.tree_at(lambda s: s.fn, sub, _Closed(problem, sub.fn))
 
     subs = jax.tree.map(closed, saveat.subs, is_leaf=_is_sub)
-    last = dfx.SubSaveAt(t1=True, fn=_Closed(problem, _state))
-    return eqx.tree_at(lambda s: s.subs, saveat, (subs, last), is_leaf=lambda x: x is None)
+    return eqx.tree_at(lambda s: s.subs, saveat, subs, is_leaf=lambda x: x is None)
 
 
-def _finished(run: _Run, solution: dfx.Solution, throw: bool) -> dfx.Solution:
+def _with_last(saveat: dfx.SaveAt, problem: AbstractEvolution) -> dfx.SaveAt:
+    """The same saves and the last state in any case."""
+    subs = (saveat.subs, dfx.SubSaveAt(t1=True, fn=_Closed(problem, _state)))
+    return eqx.tree_at(lambda s: s.subs, saveat, subs, is_leaf=lambda x: x is None)
+
+
+def _finished(run: Run, solution: dfx.Solution, throw: bool) -> dfx.Solution:
     """The solution as asked for; an error with the last good state if it ended early."""
     assert solution.ts is not None and solution.ys is not None
     (ts, (t_last,)), (ys, last) = solution.ts, solution.ys
@@ -340,7 +207,7 @@ def _finished(run: _Run, solution: dfx.Solution, throw: bool) -> dfx.Solution:
     raise IntegrationError(_reason(run, solution, t, state), solution, t, state)
 
 
-def _reason(run: _Run, solution: dfx.Solution, t: float, state) -> str:
+def _reason(run: Run, solution: dfx.Solution, t: float, state) -> str:
     steps, rejected = (
         int(solution.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected")
     )
@@ -362,36 +229,3 @@ def _reason(run: _Run, solution: dfx.Solution, t: float, state) -> str:
         f"{steps} steps were accepted and {rejected} refused; the last good state has values up to "
         f"{largest:.3g} and is kept as `state` of this error"
     )
-
-
-# --- checks --------------------------------------------------------------------------------
-
-
-def _as_float(x) -> Array:
-    x = jnp.asarray(x)
-    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
-
-
-def _check_times(t0, t1, dt0) -> None:
-    for name, value in (("t0", t0), ("t1", t1), ("dt0", dt0)):
-        if value is not None and not bool(jnp.isfinite(value)):
-            raise ValueError(f"{name} = {float(value)} is not finite")
-    if dt0 is not None and not float(dt0 * jnp.sign(t1 - t0)) > 0 and t0 != t1:
-        raise ValueError(f"a step dt0 = {float(dt0)} does not lead from {float(t0)} to {float(t1)}")
-
-
-def _check_state(problem: AbstractEvolution, t0, u0, args) -> None:
-    for leaf in jax.tree.leaves(u0):
-        values = np.asarray(leaf)
-        raise_at(_bad_rows(values), "the state at point {i} is not finite: {v}", values)
-    rate = eqx.filter_jit(problem.rate)(t0, u0, args)
-    have, want = (str(jax.tree.structure(tree)) for tree in (rate, u0))
-    if have != want:
-        raise ValueError(f"the state is a {want}, its rate a {have}")
-    for leaf in jax.tree.leaves(rate):
-        values = np.asarray(leaf)
-        raise_at(_bad_rows(values), "the right-hand side at point {i} is not finite: {v}", values)
-
-
-def _bad_rows(values: np.ndarray) -> np.ndarray:
-    return ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)

@@ -9,6 +9,7 @@ from .borders import detect_border as detect_border
 from .borders import find_border as find_border
 from .boundary import Closure as Closure
 from .boundary import close as close
+from .build import choose_neighbors as choose_neighbors
 from .cells import SearchCapacity as SearchCapacity
 from .cells import allocate as allocate
 from .cells import search_neighbors as search_neighbors
@@ -34,7 +35,6 @@ from .neighbors import Neighbors as Neighbors
 from .neighbors import find_neighbors as find_neighbors
 from .neighbors import tube_ratio as tube_ratio
 from .operators import biharmonic as biharmonic
-from .operators import choose_neighbors as choose_neighbors
 from .operators import diffusion as diffusion
 from .operators import directional_derivative as directional_derivative
 from .operators import laplace_beltrami as laplace_beltrami

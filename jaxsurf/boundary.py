@@ -22,10 +22,10 @@ import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
 from .borders import Border, find_border
+from .build import stencil_weights
 from .cloud import PointCloud, is_concrete
 from .conditions import Condition, checked_conditions
 from .neighbors import Neighbors, nearest_of
-from .operators import stencil_weights
 from .stencils.gfdm import GFDM
 from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil

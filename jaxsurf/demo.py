@@ -22,13 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .build import choose_neighbors
 from .cloud import PointCloud
 from .curvature import gauss_curvature, mean_curvature
 from .formats import contents_of
 from .frames import tangent_frames
 from .io import read, write
 from .neighbors import Neighbors
-from .operators import choose_neighbors, laplace_beltrami
+from .operators import laplace_beltrami
 from .plot import plot_fields
 from .shapes.implicit import double_torus, level_set, level_set_normals, project_to_level_set
 from .spectrum import Spectrum, spectral_estimate

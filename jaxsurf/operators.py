@@ -2,19 +2,14 @@ r"""Differential operators on point clouds: on surfaces, and in flat space."""
 
 from __future__ import annotations
 
-import warnings
-
-import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from .cloud import PointCloud, is_concrete
-from .neighbors import Neighbors, find_neighbors, nearest_of
+from .build import build
+from .cloud import PointCloud
+from .neighbors import Neighbors, find_neighbors
 from .stencils.dcpse import DCPSE, FlatDCPSE
-from .stencils.method import AbstractMethod, Neighborhood
-from .stencils.moments import blockwise
+from .stencils.method import AbstractMethod
 from .stencils.stencil import Composition, Stencil
 from .stencils.targets import Gradient, Hessian, Laplacian, Partial
 
@@ -55,7 +50,7 @@ def laplace_beltrami(
         >>> bool(jnp.abs(js.laplace_beltrami(cloud)(z) + 2 * z).max() < 0.05)
         True
     """
-    return _build(cloud, neighbors, method, Laplacian(), throw)
+    return build(cloud, neighbors, method, Laplacian(), throw)
 
 
 def surface_gradient(
@@ -90,7 +85,7 @@ def surface_gradient(
         >>> bool(jnp.abs(js.surface_gradient(cloud)(z) - exact).max() < 0.01)
         True
     """
-    return _build(cloud, neighbors, method, Gradient(), throw)
+    return build(cloud, neighbors, method, Gradient(), throw)
 
 
 def surface_divergence(
@@ -124,7 +119,7 @@ def surface_divergence(
         >>> bool(jnp.abs(js.surface_divergence(cloud)(cloud.normals) - 1).max() < 0.01)
         True
     """
-    gradient = _build(cloud, neighbors, method, Gradient(), throw)
+    gradient = build(cloud, neighbors, method, Gradient(), throw)
     return Stencil(gradient.indices, gradient.weights, (), (cloud.dim,), gradient.diagnostics)
 
 
@@ -153,7 +148,7 @@ def directional_derivative(
     Raises:
         ValueError: as `laplace_beltrami`; a direction of the wrong shape.
     """
-    gradient = _build(cloud, neighbors, method, Gradient(), throw)
+    gradient = build(cloud, neighbors, method, Gradient(), throw)
     direction = _field(direction, (cloud.n, cloud.dim), "direction")
     weights = jnp.einsum("na,kan->kn", direction, gradient.weights)
     return Stencil(gradient.indices, weights, diagnostics=gradient.diagnostics)
@@ -194,10 +189,10 @@ def diffusion(
     """
     d = jnp.asarray(diffusivity)
     if d.shape == (cloud.n,):
-        stencil = _build(cloud, neighbors, method, Laplacian(), throw)
+        stencil = build(cloud, neighbors, method, Laplacian(), throw)
         weights = stencil.weights * (d + d[stencil.indices]) / 2
     elif d.shape == (cloud.n, cloud.dim, cloud.dim):
-        stencil = _build(cloud, neighbors, method, Hessian(), throw)
+        stencil = build(cloud, neighbors, method, Hessian(), throw)
         project = jnp.eye(cloud.dim) - cloud.normals[:, :, None] * cloud.normals[:, None]
         d = jnp.einsum("nab,nbc,ncd->nad", project, (d + d.mT) / 2, project)
         mean = (d + d[stencil.indices]) / 2
@@ -282,172 +277,7 @@ def partial_derivative(
         neighbors = find_neighbors(points, count)
     # The method looks at offsets only; the normals are there for the form.
     cloud = PointCloud(points, jnp.zeros_like(points).at[:, 0].set(1))
-    return _build(cloud, neighbors, method, target, throw)
-
-
-# --- building ------------------------------------------------------------------------------
-
-# A stencil is adapted if the weight of its centre is less than this share of all the others.
-_DOMINANCE = 0.2
-# Growth of the neighbourhoods of such points, tried in turn.
-_GROWTH = (1.5, 2.25, 3.4)
-
-
-def choose_neighbors(
-    cloud: PointCloud,
-    *,
-    method: AbstractMethod = DCPSE(order=2),
-    bound: Bool[Array, " n"] | None = None,
-    throw: bool = True,
-) -> Neighbors:
-    r"""Neighbourhoods suited to a method, larger where the points are irregular.
-
-    Every point gets the number of neighbours that the method asks for. Where the
-    Laplacian's weight of the centre is then positive or small,
-    $-w_{ii} < 0.2 \sum_{j \ne i} |w_{ij}|$, or its conditions cannot be met, the neighbourhood
-    grows by half, up to three times. Such points are what gives collocation matrices
-    eigenvalues with positive real part (`experiments`, stability study). On a border no
-    one-sided Laplacian has a dominant centre, however large: there neighbourhoods grow only
-    where the conditions cannot be met.
-
-    Args:
-        cloud: n points in d dimensions with unit normals; concrete.
-        method: how the weights will be computed.
-        bound: True for points that need no stencil, `(n,)`, as a boundary condition gives their
-            values (`Closure.bound`); their rows are switched off and never grow.
-        throw: passed on to `find_neighbors`.
-
-    Returns:
-        Neighbour lists; rows that did not grow are padded.
-    """
-    needed = np.ones(cloud.n, bool) if bound is None else ~np.asarray(bound)
-    neighbors = _adapted(cloud, method, throw, needed)[0]
-    mask = neighbors.mask & jnp.asarray(needed)[:, None]
-    return Neighbors(neighbors.indices, mask, neighbors.radius)
-
-
-def _build(cloud, neighbors, method, target, throw) -> Stencil:
-    weights = None
-    if neighbors is None:
-        neighbors, laplacian = _adapted(cloud, method, throw)
-        if isinstance(target, Laplacian):
-            weights = laplacian
-    _check_sizes(cloud, neighbors, method, target, throw)
-    if weights is None:
-        weights = stencil_weights(cloud, neighbors, method, target)
-    values, diagnostics = weights
-    components = values.shape[1:-1]
-    stencil = Stencil(neighbors.indices.T, values, components, (), diagnostics)
-    if throw and is_concrete(values):
-        _check(stencil, neighbors, method, target, cloud.dim)
-    return stencil
-
-
-@eqx.filter_jit
-def stencil_weights(cloud, neighbors, method, target, rows=None):
-    """Weights `(k, *components, r)` and diagnostics of all stencils, or of those of some rows."""
-    rows = jnp.arange(cloud.n) if rows is None else rows
-    radius = neighbors.radius
-    around = Neighborhood(
-        cloud.points[neighbors.indices] - cloud.points[rows][:, None],
-        cloud.normals[neighbors.indices],
-        neighbors.mask,
-        None if radius is None else jnp.broadcast_to(radius, (cloud.n,))[rows],
-    )
-    weights, diagnostics = blockwise(
-        lambda one: method.weights(one, target), method.batch_size, around
-    )
-    return jnp.moveaxis(weights, (-1, 0), (0, -1)), diagnostics
-
-
-def _adapted(cloud, method, throw, needed=True) -> tuple[Neighbors, tuple | None]:
-    """Neighbours that suit the method, and the Laplacian's weights unless some rows grew."""
-    if not is_concrete(*jax.tree.leaves(cloud)):
-        raise ValueError("neighbors=None needs concrete arrays; under jit pass the neighbours")
-    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
-    available = int(on.sum())
-    k = min(method.neighbor_count(cloud.dim), available)
-    neighbors = find_neighbors(cloud, k, throw=throw)
-    _check_sizes(cloud, neighbors, method, Laplacian(), throw)
-    weights = stencil_weights(cloud, neighbors, method, Laplacian())
-    border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
-    poor = np.flatnonzero(on & needed & _is_poor(weights, border))
-    widths = [min(int(k * growth), available) for growth in _GROWTH]
-    if not poor.size or widths[-1] == k:
-        return neighbors, weights
-
-    # Filled up with copies, so that few shapes are ever compiled.
-    rows = np.resize(poor, max(64, 1 << (poor.size - 1).bit_length()))
-    indices, mask = nearest_of(cloud, rows, widths[-1])
-    chosen = np.full(rows.size, widths[-1])
-    still = np.ones(rows.size, bool)
-    for width in widths[:-1]:
-        narrow = Neighbors(jnp.asarray(indices), jnp.asarray(mask & _first(width, mask)))
-        again = stencil_weights(cloud, narrow, method, Laplacian(), jnp.asarray(rows))
-        again = _is_poor(again, border[rows])
-        chosen = np.where(still & ~again, width, chosen)
-        still &= again
-    widest = chosen.max()
-    mask = (mask & _first(chosen[:, None], mask))[:, :widest]
-    indices = np.where(mask, indices[:, :widest], rows[:, None])
-    extra = ((0, 0), (0, widest - k))
-    all_indices = np.pad(np.asarray(neighbors.indices), extra)
-    all_indices[:, k:] = np.arange(cloud.n)[:, None]
-    all_mask = np.pad(np.asarray(neighbors.mask), extra)
-    all_indices[rows], all_mask[rows] = indices, mask
-    return Neighbors(jnp.asarray(all_indices), jnp.asarray(all_mask)), None
-
-
-def _first(count, mask: np.ndarray) -> np.ndarray:
-    return np.arange(mask.shape[1]) < count
-
-
-def _is_poor(stencils, border) -> np.ndarray:
-    weights, residual = np.asarray(stencils[0]), np.asarray(stencils[1].residual)
-    others = np.sum(np.abs(weights[1:]), axis=0)
-    dominant = border | (-weights[0] >= _DOMINANCE * others)
-    return ~(dominant & (residual < _tolerance(weights.dtype)))
-
-
-# --- checks --------------------------------------------------------------------------------
-
-
-def _tolerance(dtype) -> float:
-    """Largest relative moment residual of a stencil that counts as determined."""
-    return float(np.finfo(dtype).eps) ** 0.5
-
-
-def _check_sizes(cloud, neighbors, method, target, throw) -> None:
-    if neighbors.n != cloud.n:
-        raise ValueError(f"neighbours of {neighbors.n} points, the cloud has {cloud.n}")
-    need = method.basis_size(cloud.dim, target)
-    if throw and neighbors.k < need:
-        raise ValueError(f"k = {neighbors.k} neighbours, {method} needs at least {need}")
-
-
-def _check(stencil: Stencil, neighbors, method, target, dim) -> None:
-    diagnostics = stencil.diagnostics
-    assert diagnostics is not None
-    on = np.asarray(neighbors.mask[:, 0])
-    count, residual = np.asarray(diagnostics.count), np.asarray(diagnostics.residual)
-    bad = np.flatnonzero(on & ~(residual < _tolerance(residual.dtype)))
-    if bad.size:
-        i = bad[0]
-        raise ValueError(
-            f"degenerate stencil at point {i}: relative moment residual {residual[i]:.1e} with "
-            f"{count[i]} points within the support {float(diagnostics.support[i]):.3g}, {method} "
-            f"needs at least {method.basis_size(dim, target)} in general position "
-            f"({bad.size} such points)"
-        )
-    tube = np.where(on, np.asarray(diagnostics.tube), 0)
-    if tube.max(initial=0) > 1:
-        i = int(tube.argmax())
-        warnings.warn(
-            f"the surface bends within one stencil: support x curvature = {tube[i]:.2f} at point "
-            f"{i} ({int(np.sum(tube > 1))} points above 1). Use more points there or a smaller "
-            "support",
-            stacklevel=4,
-        )
+    return build(cloud, neighbors, method, target, throw)
 
 
 def _field(values, shape: tuple[int, ...], name: str):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxsurf.stencils.kernels import gaussian, support, taper
-from jaxsurf.stencils.moments import blockwise, moment_solve
+from jaxsurf.stencils.moments import blockwise, in_blocks, moment_solve, out_of_blocks
 from jaxsurf.stencils.monomials import differentiation, monomials, multi_indices
 from jaxsurf.stencils.targets import Gradient, Hessian, Laplacian, Partial
 
@@ -104,9 +104,23 @@ def test_degenerate_points_are_reported():
 
 
 def test_blocks_equal_one_batch():
-    x = jnp.arange(70.0).reshape(35, 2)
-    for size in (1, 8, 35, 100):
-        np.testing.assert_array_equal(blockwise(lambda r: jnp.sum(r**2), size, x), (x**2).sum(1))
+    x = jnp.arange(70.0).reshape(2, 35)
+    for size in (1, 8, 35):
+        found = blockwise(lambda block: jnp.sum(block**2, axis=0), in_blocks(x, size))
+        np.testing.assert_array_equal(out_of_blocks(found, 35), (x**2).sum(0))
+
+
+@pytest.mark.parametrize("high", [2, 5])  # a small system and a large one
+def test_points_of_a_block_do_not_mix(high):
+    rng = np.random.default_rng(8)
+    x, w = jnp.asarray(rng.uniform(-1, 1, (3, 200, 3))), jnp.asarray(rng.uniform(0.1, 1, (200, 3)))
+    b = jnp.asarray(Hessian().moments(3, 1, high))
+    eta, condition, residual = moment_solve(x, w, b, 1, high)
+    for i in range(3):
+        alone = moment_solve(x[..., i], w[..., i], b, 1, high)
+        np.testing.assert_allclose(eta[..., i], alone[0], rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(condition[i], alone[1], rtol=1e-9)
+        assert residual[i] < 1e-11
 
 
 def test_taper_is_twice_differentiable_at_the_edge():

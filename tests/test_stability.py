@@ -1,11 +1,14 @@
 """Spectra of the default Laplacians: no eigenvalue with positive real part beyond round-off."""
 
+import warnings
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
 
 import jaxsurf as js
+from experiments import data
 
 from .helpers import METHODS, jittered_sphere, label, random_sphere
 
@@ -43,3 +46,18 @@ def test_irregular_points_get_larger_neighborhoods():
         CLOUDS["random"], js.find_neighbors(CLOUDS["random"], k=even.k), method=method
     ).weights
     assert jnp.any(plain[0] > 0)
+
+
+def test_folds_of_a_scan_get_smaller_neighborhoods():
+    try:
+        cloud = data.bunny(2_960)
+    except FileNotFoundError as error:
+        pytest.skip(str(error))
+    method = js.GFDM(degree=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # it bends within one stencil
+        counts = np.asarray(js.choose_neighbors(cloud, method=method).mask.sum(axis=1))
+        spectrum = js.spectral_estimate(js.laplace_beltrami(cloud, method=method))
+    usual = method.neighbor_count(3)
+    assert counts.min() < usual < counts.max()
+    assert spectrum.abscissa < 1e-6 * spectrum.radius

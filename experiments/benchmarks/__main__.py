@@ -65,13 +65,12 @@ def table(results: list[dict], quick: bool) -> str:
     n, gradient_n = (20_000, 2_000) if quick else (100_000, 10_000)
     lines = [
         f"Sphere, n = {n:,}, float64, {platform.machine()}, 2 cores, jax {jax.__version__}; "
-        f"gradient and its ratio to the forward pass at n = {gradient_n:,}. Peers as measured on "
-        "such a machine, one process.",
+        f"gradient at n = {gradient_n:,}, its memory the temporaries of the compiled program. "
+        "Peers as measured on such a machine, one process.",
         "",
-        "| method | k | build s | first call s | apply ms | gradient s | / forward | peak GiB "
-        "| peer | "
-        "its build s | its apply ms |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| method | k | build s | first call s | apply ms | peak GiB | gradient s | / forward "
+        "| its memory / forward | its first call s | peer | its build s | its apply ms |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, (_, k) in cases.METHODS.items():
         build = find(results, "build", name, n)
@@ -80,26 +79,37 @@ def table(results: list[dict], quick: bool) -> str:
         reverse = find(results, "gradient", name, gradient_n, True)
         lines.append(
             f"| `{name}` | {k} | {build['build s']:.2f} | {build['first call s']:.1f} "
-            f"| {apply['ours ms']:.2f} | {reverse['s']:.2f} | {reverse['s'] / forward['s']:.1f} "
-            f"| {build['peak GiB']:.2f} | " + " | ".join(PEERS[name]) + " |"
+            f"| {apply['ours ms']:.2f} | {build['peak GiB']:.2f} "
+            f"| {reverse['s']:.3f} | {reverse['s'] / forward['s']:.1f} "
+            f"| {reverse['temporary MiB'] / forward['temporary MiB']:.1f} "
+            f"| {reverse['compile s']:.1f} | " + " | ".join(PEERS[name]) + " |"
         )
-    lines += ["", "| applying | SciPy CSR ms | ours ms | ratio | share of bandwidth |",
-              "|---|---|---|---|---|"]  # fmt: skip
+    lines += ["", "| applying | SciPy CSR ms | without zeros | ours ms | ours / SciPy "
+              "| share of bandwidth |",
+              "|---|---|---|---|---|---|"]  # fmt: skip
     for r in results:
         if r["case"] == "apply" and r["arguments"][1] in (20, 40):
             (m, k), v = r["arguments"], r["result"]
             lines.append(
-                f"| n = {m:,}, k = {k} | {v['SciPy CSR ms']:.2f} | {v['ours ms']:.2f} "
+                f"| n = {m:,}, k = {k} | {v['SciPy CSR ms']:.2f} "
+                f"| {v['SciPy without zeros ms']:.2f} | {v['ours ms']:.2f} "
                 f"| {v['ratio']:.2f} | {v['share of bandwidth']:.0%} |"
             )
-    lines += ["", "| building GFDM | NumPy s | ours s | NumPy / ours |", "|---|---|---|---|"]
+    lines += ["", "| building GFDM | ours s | NumPy s | / ours | NumPy in blocks s | / ours |",
+              "|---|---|---|---|---|---|"]  # fmt: skip
     for r in results:
         if r["case"] == "build_beside_numpy":
             (degree, k, _), v = r["arguments"], r["result"]
             lines.append(
-                f"| degree {degree}, k = {k} | {v['NumPy s']:.2f} | {v['ours s']:.2f} "
-                f"| {v['NumPy / ours']:.1f} |"
+                f"| degree {degree}, k = {k} | {v['ours s']:.2f} "
+                f"| {v['NumPy s']:.2f} | {v['NumPy / ours']:.1f} "
+                f"| {v['NumPy in blocks s']:.2f} | {v['NumPy in blocks / ours']:.1f} |"
             )
+    plain = find(results, "build_beside_plain_jax", n)
+    lines += ["", "| GFDM(degree=2), k = 20 | ours s | plain JAX s |", "|---|---|---|",
+              f"| build | {plain['ours s']:.3f} | {plain['plain JAX s']:.3f} |",
+              f"| gradient | {plain['gradient ours s']:.3f} "
+              f"| {plain['gradient plain JAX s']:.3f} |"]  # fmt: skip
     lines += ["", "| DCPSE(order=2), n | build s | peak GiB |", "|---|---|---|"]
     for r in results:
         if r["case"] == "build" and r["arguments"][0] == "DCPSE(order=2)":

@@ -12,8 +12,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .kernels import gaussian, support, taper
-from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive
+from .kernels import gaussian, taper
+from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive, with_center
 from .moments import moment_solve
 from .targets import AbstractTarget, Laplacian
 
@@ -64,28 +64,24 @@ class DCPSE(AbstractMethod):
         return 64 if self.order < 3 else 32
 
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
-        offsets, normals, mask = neighborhood.offsets, neighborhood.normals, neighborhood.mask
-        k, dim = offsets.shape
-        r2 = jnp.sum(offsets**2, axis=1)
-        given = neighborhood.radius if self.support is None else self.support
-        radius = support(r2, mask, dim=dim - 1, radius=given)
+        k, dim = neighborhood.offsets.shape[:2]
+        radius = neighborhood.support(dim - 1, self.support)
         width = radius * (_width(self.order) if self.width is None else self.width)
         count = _layers(self.order) if self.layers is None else self.layers
         step = radius / (count + 0.5) if self.layer_spacing is None else self.layer_spacing
 
-        heights = step * jnp.arange(-count, count + 1)
-        copies = offsets[:, None] + heights[:, None] * normals[:, None]
-        copies = copies.reshape(k * (2 * count + 1), dim)
+        # One layer after another, the coordinate first: (d, layers * k, *p).
+        x, n = (jnp.swapaxes(a, 0, 1) for a in (neighborhood.offsets, neighborhood.normals))
+        layers = [x + m * step * n for m in range(-count, count + 1)]
+        copies = jnp.concatenate(layers, axis=1)
         # On the hollow side copies are nearer than their point, so the point itself has to fade
         # as it leaves the support.
-        fade = jnp.where(mask, taper(r2 / radius**2), 0)
-        fade = jnp.repeat(fade, 2 * count + 1)
+        fade = jnp.where(neighborhood.mask, taper(neighborhood.squared / radius**2), 0)
+        fade = jnp.concatenate([fade] * len(layers))
         eta, condition, residual = _kernel(copies, fade, width, radius, target, self.order)
-        eta = jnp.sum(eta.reshape(-1, k, 2 * count + 1), axis=2)
+        eta = jnp.sum(eta.reshape(-1, len(layers), k, *radius.shape), axis=1)
         diagnostics = Diagnostics.of(neighborhood, condition, residual, radius, count)
-        return target.assemble(
-            _with_center(eta, target.order), jnp.eye(dim, dtype=eta.dtype)
-        ), diagnostics
+        return _in_space(eta, target), diagnostics
 
 
 class FlatDCPSE(AbstractMethod):
@@ -122,17 +118,13 @@ class FlatDCPSE(AbstractMethod):
         return 64
 
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
-        offsets, mask = neighborhood.offsets, neighborhood.mask
-        dim = offsets.shape[1]
-        given = neighborhood.radius if self.support is None else self.support
-        radius = support(jnp.sum(offsets**2, axis=1), mask, dim=dim, radius=given)
+        x = jnp.swapaxes(neighborhood.offsets, 0, 1)
+        radius = neighborhood.support(len(x), self.support)
         width = radius * (_width(self.order) if self.width is None else self.width)
-        eta, condition, residual = _kernel(
-            offsets, mask.astype(offsets.dtype), width, radius, target, self.order
-        )
+        on = neighborhood.mask.astype(x.dtype)
+        eta, condition, residual = _kernel(x, on, width, radius, target, self.order)
         diagnostics = Diagnostics.of(neighborhood, condition, residual, radius, 0)
-        weights = _with_center(eta, target.order)
-        return target.assemble(weights, jnp.eye(dim, dtype=weights.dtype)), diagnostics
+        return _in_space(eta, target), diagnostics
 
 
 # Neighbours to look for on a surface, by order; see `experiments` (stability study).
@@ -155,21 +147,16 @@ def _degrees(derivative: int, order: int) -> tuple[int, int]:
 def _kernel(x, factor, width, radius, target, order):
     """DC-PSE kernel (eqs. 5 to 7) at the points x, of weight Gaussian times a given factor."""
     low, high = _degrees(target.order, order)
-    scaled = x / width
-    r2 = jnp.sum(x**2, axis=1)
-    w = factor * gaussian(r2, width, radius)
-    b = jnp.asarray(target.moments(x.shape[1], low, high), x.dtype)
-    eta, condition, residual = moment_solve(scaled.T, w, b, low, high)
+    w = factor * gaussian(jnp.sum(x**2, axis=0), width, radius)
+    b = jnp.asarray(target.moments(len(x), low, high), x.dtype)
+    eta, condition, residual = moment_solve(x / width, w, b, low, high)
     return eta / width**target.order, condition, residual
 
 
-def _with_center(eta: Float[Array, "c k"], derivative: int) -> Float[Array, "c k"]:
+def _in_space(eta: Float[Array, "c k *p"], target: AbstractTarget):
     """Weights on the values themselves, from those on sums and differences with the centre.
 
     For even derivatives the kernel acts on differences (eq. 4), which takes the sum of all
     weights from the centre. For odd ones that sum is zero already: it is the moment of degree 0.
     """
-    if derivative % 2:
-        return eta
-    others = eta.at[:, 0].set(0)
-    return others.at[:, 0].set(-jnp.sum(others, axis=1))
+    return target.components(eta if target.order % 2 else with_center(eta))

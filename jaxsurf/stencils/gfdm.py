@@ -11,8 +11,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..frames import tangent_frames
-from .kernels import gaussian, support
-from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive
+from .kernels import gaussian
+from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive, dot, with_center
 from .moments import moment_solve
 from .targets import AbstractTarget
 
@@ -59,18 +59,15 @@ class GFDM(AbstractMethod):
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
         offsets, mask = neighborhood.offsets, neighborhood.mask
         dim = offsets.shape[1]
-        r2 = jnp.sum(offsets**2, axis=1)
-        given = neighborhood.radius if self.support is None else self.support
-        radius = support(r2, mask, dim=dim - 1, radius=given)
+        radius = neighborhood.support(dim - 1, self.support)
         width = radius * (_width(self.degree) if self.width is None else self.width)
 
-        tangents = tangent_frames(neighborhood.normals[:1])[0, :-1]
-        plane = (offsets @ tangents.T) / width
-        w = jnp.where(mask, gaussian(r2, width, radius), 0)
+        tangents = jnp.moveaxis(tangent_frames(neighborhood.normals[0].T), 0, -1)[:-1]
+        plane = jnp.stack([dot(offsets, t[None]) for t in tangents]) / width
+        w = gaussian(neighborhood.squared, width, radius, mask)
         b = jnp.asarray(target.moments(dim - 1, 1, self.degree), offsets.dtype)
-        eta, condition, residual = moment_solve(plane.T, w, b, 1, self.degree)
-        eta = eta / width**target.order
-        eta = eta.at[:, 0].set(-jnp.sum(eta[:, 1:], axis=1))
+        eta, condition, residual = moment_solve(plane, w, b, 1, self.degree)
+        eta = with_center(eta / width**target.order)
         diagnostics = Diagnostics.of(neighborhood, condition, residual, radius, 0)
         return target.assemble(eta, tangents), diagnostics
 

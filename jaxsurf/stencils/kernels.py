@@ -18,9 +18,16 @@ def taper(s: Float[Array, "*q"]) -> Float[Array, "*q"]:
     return jnp.where(inside, (1 - s**4) ** 3, 0)
 
 
-def gaussian(r2: Float[Array, "*q"], width, radius) -> Float[Array, "*q"]:
-    r"""$e^{-r^2/\epsilon^2}$ (Singh et al. 2023, eq. 5), tapered to zero at the radius."""
-    return jnp.exp(-r2 / width**2) * taper(r2 / radius**2)
+def gaussian(r2: Float[Array, "*q"], width, radius, on=True) -> Float[Array, "*q"]:
+    r"""$e^{-r^2/\epsilon^2}$ (Singh et al. 2023, eq. 5), tapered to zero at the radius.
+
+    Zero also where `on` is False. Written as one exponential, which is then computed once:
+    a product of two factors would be formed again at every use.
+    """
+    s = r2 / radius**2
+    inside = on & (s < 1)
+    log_taper = 3 * jnp.log(1 - jnp.where(inside, s, 0) ** 4)
+    return jnp.exp(jnp.where(inside, log_taper - r2 / width**2, -jnp.inf))
 
 
 # Of k listed neighbours the support takes in about three quarters on even points, so that it
@@ -31,12 +38,12 @@ _MEAN_WEIGHT = {1: 16 / 35, 2: 1 / 4, 3: 16 / 105}
 
 
 def support(
-    r2: Float[Array, " k"],
-    mask: Bool[Array, " k"],
+    r2: Float[Array, "k *p"],
+    mask: Bool[Array, "k *p"],
     *,
     dim: int,
-    radius: Float[Array, ""] | float | None = None,
-) -> Float[Array, ""]:
+    radius: Float[Array, "*p"] | float | None = None,
+) -> Float[Array, "*p"]:
     r"""Support radius $\rho$ of one neighbourhood: the given one, or one that the points fill.
 
     Without a given radius it is the length at which the neighbours, counted with weights that
@@ -53,9 +60,9 @@ def support(
     Differentiable: forward and reverse; the root by the implicit function theorem.
     """
     if radius is None:
-        target = _SHARE * _MEAN_WEIGHT[dim] * jnp.sum(mask)
+        target = _SHARE * _MEAN_WEIGHT[dim] * jnp.sum(mask, axis=0)
         return _soft_radius(r2, mask, jnp.maximum(target, 1.2), dim)
-    return jnp.asarray(radius, r2.dtype)
+    return jnp.broadcast_to(jnp.asarray(radius, r2.dtype), r2.shape[1:])
 
 
 def _soft_radius(r2, mask, target, dim):
@@ -64,25 +71,32 @@ def _soft_radius(r2, mask, target, dim):
 
     def count(r2, t):
         s = jnp.minimum(r2 * jnp.exp(-2 * t), 1)
-        return jnp.sum(jnp.where(mask, (1 - s) ** 3, 0))
+        return jnp.sum(jnp.where(mask, (1 - s) ** 3, 0), axis=0)
 
     def slope(t):
         s = jnp.minimum(frozen * jnp.exp(-2 * t), 1)
-        return jnp.sum(jnp.where(mask, 6 * s * (1 - s) ** 2, 0))
+        return jnp.sum(jnp.where(mask, 6 * s * (1 - s) ** 2, 0), axis=0)
 
-    def newton(_, state):
+    def newton(state):
         # In an even set log(count) is a straight line in t = log(radius), nearly; where a step
         # leaves the bracket, it is halved instead.
-        low, high, t = state
+        low, high, t, _, steps = state
         value = count(frozen, t)
         low, high = jnp.where(value < target, t, low), jnp.where(value < target, high, t)
         step = t + jnp.log(target / value) * value / jnp.maximum(slope(t), 1e-3 * value)
         inside = (step >= low) & (step <= high)
-        return low, high, jnp.where(inside, step, (low + high) / 2)
+        new = jnp.where(inside, step, (low + high) / 2)
+        return low, high, new, jnp.max(jnp.abs(new - t)), steps + 1
 
-    # The radius that holds the share of the list, hard counted, is a good start.
-    start = jnp.sort(jnp.where(mask, frozen, 0))[-1 - jnp.sum(mask) * 6 // 25]
-    start = 0.5 * jnp.log(jnp.where(start > 0, start, 1))
-    t = jax.lax.fori_loop(0, 8, newton, (start - 5, start + 5, start))[2]
+    def moving(state):
+        # The last step below is one more, and squares what error is left.
+        return (state[3] > jnp.finfo(r2.dtype).eps ** 0.5) & (state[4] < 50)
+
+    # A disc that is filled evenly out to the radius R has a mean r^2 of R^2 / 2, a ball of any
+    # dimension about that; the share of the list that is wanted takes part of it.
+    mean = jnp.sum(jnp.where(mask, frozen, 0), axis=0) / jnp.sum(mask, axis=0)
+    start = 0.5 * jnp.log(jnp.where(mean > 0, 2 * _SHARE * mean, 1))
+    infinite = jnp.asarray(jnp.inf, r2.dtype)
+    t = jax.lax.while_loop(moving, newton, (start - 5, start + 5, start, infinite, 0))[2]
     # One more step, the only one that is differentiated: the implicit function theorem.
     return jnp.exp(t + (target - count(r2, t)) / jnp.maximum(slope(t), 1e-3))

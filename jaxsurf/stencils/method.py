@@ -9,16 +9,31 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .kernels import support
 from .targets import AbstractTarget
 
 
 class Neighborhood(eqx.Module):
-    """What one stencil sees: offsets and normals of the neighbours, centre first."""
+    """What the stencils of a block of points see: offsets and normals of the neighbours.
 
-    offsets: Float[Array, "k d"]
-    normals: Float[Array, "k d"]
-    mask: Bool[Array, " k"]
-    radius: Float[Array, ""] | None
+    The centre comes first. The last axis, `*p`, is the points of the block; without it, all
+    that is made of a neighbourhood is for a single point.
+    """
+
+    offsets: Float[Array, "k d *p"]
+    normals: Float[Array, "k d *p"]
+    mask: Bool[Array, "k *p"]
+    radius: Float[Array, "*p"] | None
+
+    def support(self, dim: int, given: float | None) -> Float[Array, "*p"]:
+        """Support radius of a method: the given one, that of the search, or a length filled."""
+        radius = self.radius if given is None else given
+        return support(self.squared, self.mask, dim=dim, radius=radius)
+
+    @property
+    def squared(self) -> Float[Array, "k *p"]:
+        """Squared distances from the centre."""
+        return dot(self.offsets, self.offsets)
 
 
 class Diagnostics(eqx.Module):
@@ -45,14 +60,20 @@ class Diagnostics(eqx.Module):
     @classmethod
     def of(cls, around: Neighborhood, condition, residual, support, layers: int) -> Diagnostics:
         """Diagnostics of one stencil: what the solve tells, and what its geometry does."""
-        r2 = jnp.sum(around.offsets**2, axis=1)
+        r2 = around.squared
         inside = around.mask & (r2 < support**2)
-        turn = jnp.sum(around.offsets * (around.normals - around.normals[0]), axis=1)
+        turn = dot(around.offsets, around.normals - around.normals[0])
         bend = jnp.where(inside & (r2 > 0), jnp.abs(turn) / jnp.where(r2 > 0, r2, 1), 0)
-        values = (condition, residual, jnp.sum(inside), support)
         return jax.tree.map(
             jax.lax.stop_gradient,
-            cls(*values, jnp.asarray(layers), jnp.max(bend) * support),
+            cls(
+                condition,
+                residual,
+                jnp.sum(inside, axis=0),
+                support,
+                jnp.full(support.shape, layers),
+                jnp.max(bend, axis=0) * support,
+            ),
         )
 
 
@@ -70,8 +91,8 @@ class AbstractMethod(eqx.Module):
     @abc.abstractmethod
     def weights(
         self, neighborhood: Neighborhood, target: AbstractTarget
-    ) -> tuple[Float[Array, "... k"], Diagnostics]:
-        """Weights of one stencil, `(*components, k)`, in units of length to the minus order."""
+    ) -> tuple[Float[Array, "... k *p"], Diagnostics]:
+        """Weights of stencils, `(*components, k, *p)`, in units of length to the minus order."""
 
     @property
     @abc.abstractmethod
@@ -87,3 +108,13 @@ def check_positive(method: AbstractMethod, *names: str) -> None:
             raise ValueError(
                 f"{type(method).__name__}: {name} = {value}, expected a positive number"
             )
+
+
+def with_center(eta: Float[Array, "c k *p"]) -> Float[Array, "c k *p"]:
+    """Weights that sum to zero: those of the neighbours as given, the centre's made up."""
+    return eta.at[:, 0].set(-jnp.sum(eta[:, 1:], axis=1))
+
+
+def dot(a: Float[Array, "k d *p"], b: Float[Array, "k d *p"]) -> Float[Array, "k *p"]:
+    """Scalar products; written out, as sums over an axis between others are slow."""
+    return sum((a[:, i] * b[:, i] for i in range(1, a.shape[1])), a[:, 0] * b[:, 0])

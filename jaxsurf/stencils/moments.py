@@ -10,6 +10,9 @@ so that $\sum_q \eta_q x_q^\beta = b_\beta$: the moment conditions (6) of Singh 
 and at the same time the weighted least-norm problem (18), (19) of Suchde and Kuhnert (2019).
 The entries of A are the moments of w up to twice the degree, and many coincide: each is
 summed once.
+
+Here and in all that is built from it, arrays may have one more axis at the end, for the points of
+a block (written `*p`): arithmetic on the entries of one point then runs over all of them.
 """
 
 from __future__ import annotations
@@ -20,19 +23,20 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
-from .monomials import differentiation, monomials, multi_indices, position
+from . import systems
+from .monomials import differentiation, monomial_rows, monomials, multi_indices, position
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
 def moment_solve(
-    x: Float[Array, "dim q"],
-    w: Float[Array, " q"],
+    x: Float[Array, "dim q *p"],
+    w: Float[Array, "q *p"],
     b: Float[Array, "m c"],
     low: int,
     high: int,
-) -> tuple[Float[Array, "c q"], Float[Array, ""], Float[Array, ""]]:
+) -> tuple[Float[Array, "c q *p"], Float[Array, "*p"], Float[Array, "*p"]]:
     r"""Weights $\eta$ with prescribed moments, for c right-hand sides at once.
 
     Args:
@@ -53,15 +57,23 @@ def moment_solve(
 
 
 def _solve(x, w, b, low, high):
-    v = monomials(x, high)
-    start = _first(x.shape[0], low)
+    """What `moment_solve` returns, and what its derivative needs of it."""
+    v = monomial_rows(x, high)
+    start = len(multi_indices(len(x), 0, low - 1))
+    b = [row.reshape(-1, *(1,) * (w.ndim - 1)) for row in b.astype(w.dtype)]
+    if len(b) > systems.SMALL:
+        v = jnp.stack(v)
+        b = jnp.stack([jnp.broadcast_to(row, (len(row), *w.shape[1:])) for row in b])
     gram = _gram(x, w, low, high)
-    solve, condition = _factor(gram)
-    a = jnp.zeros((v.shape[0], b.shape[1]), v.dtype).at[start:].set(solve(b.astype(v.dtype)))
-    s = a.T @ v
+    solve, condition = systems.factor(gram)
+    a = solve(b)
+    s = systems.combine(a, v[start:])
     eta = w * s
-    residual = jnp.max(jnp.abs(v[start:] @ eta.T - b)) / jnp.max(jnp.abs(b))
-    return (eta, condition, residual), (v, solve, a, s)
+    # The moments of eta are A a.
+    errors = [jnp.abs(m - b_i) for m, b_i in zip(systems.symmetric(gram, a), b)]
+    size = functools.reduce(jnp.maximum, [jnp.max(jnp.abs(b_i), axis=0) for b_i in b])
+    residual = jnp.max(functools.reduce(jnp.maximum, errors), axis=0) / size
+    return (eta, condition, residual), (v, start, solve, a, s)
 
 
 @moment_solve.defjvp
@@ -69,20 +81,16 @@ def _moment_solve_jvp(low, high, primals, tangents):
     # With s = V a:  d eta = dw s + w (dV a + V da),  A da = -(V^T (dw s + w dV a) + dV^T (w s)).
     x, w, b = primals
     dx, dw, _ = tangents
-    (eta, condition, residual), (v, solve, a, s) = _solve(x, w, b, low, high)
-    start = _first(x.shape[0], low)
-    d = differentiation(x.shape[0], high).astype(v.dtype)
+    (eta, condition, residual), (v, start, solve, a, s) = _solve(x, w, b, low, high)
     # dV a is the gradient of the polynomial s along dx; dV^T g the same matrices transposed.
-    ds = sum((((d[i] @ a).T @ v) * dx[i] for i in range(x.shape[0])), jnp.zeros_like(s))
+    axes = [(d[:, start:], dx_i) for d, dx_i in zip(differentiation(len(x), high), dx)]
+    ds = sum(systems.combine(systems.transform(d, a), v) * dx_i for d, dx_i in axes)
     g = dw * s + w * ds
-    rhs = v @ g.T + sum(d[i].T @ (v @ (eta * dx[i]).T) for i in range(x.shape[0]))
-    da = jnp.zeros_like(a).at[start:].set(-solve(rhs[start:]))
-    d_eta = g + w * (da.T @ v)
+    rhs = systems.moments(v[start:], g)
+    for d, dx_i in axes:
+        rhs = systems.add(rhs, systems.transform(d.T, systems.moments(v, eta * dx_i)))
+    d_eta = g - w * systems.combine(solve(rhs), v[start:])
     return (eta, condition, residual), (d_eta, jnp.zeros_like(condition), jnp.zeros_like(residual))
-
-
-def _first(dim: int, low: int) -> int:
-    return len(multi_indices(dim, 0, low - 1))
 
 
 @functools.cache
@@ -96,53 +104,38 @@ def _gather_table(dim: int, low: int, high: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _gram(x, w, low, high):
+    basis = multi_indices(len(x), low, high)
+    if len(basis) <= systems.SMALL:
+        place = position(len(x), 2 * high)
+        sums = [jnp.sum(row, axis=0) for row in monomial_rows(x, 2 * high, w)]
+        total = (basis[:, None] + basis).tolist()
+        return [[sums[place[tuple(g)]] for g in row] for row in total]
     # Moments as one small matrix product: monomials in all coordinates but the last, times
     # powers of the last.
     powers = monomials(x[-1:], 2 * high)
-    others = monomials(x[:-1], 2 * high) if x.shape[0] > 1 else jnp.ones_like(x)
-    moments = (others * w) @ powers.T
-    return moments[_gather_table(x.shape[0], low, high)]
+    others = monomials(x[:-1], 2 * high) if len(x) > 1 else jnp.ones_like(x)
+    moments = jnp.einsum("aq...,bq...->ab...", others * w, powers)
+    return moments[_gather_table(len(x), low, high)]
 
 
-def _factor(gram):
-    """A solver for the equilibrated matrix, and its condition estimate.
+def in_blocks(a: Shaped[Array, "*s n"], size: int) -> Shaped[Array, "blocks *s size"]:
+    """The last axis cut into blocks; the last block is filled up with copies of the last entry."""
+    missing = -a.shape[-1] % size
+    a = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, missing)], mode="edge")
+    return jnp.moveaxis(a.reshape(*a.shape[:-1], -1, size), -2, 0)
 
-    The factorisation gets a shift of the size of round-off, so that it exists also where a
-    moment is dependent on the others (a flat surface with few normal copies, say); one step of
-    refinement on the unshifted matrix takes the effect of the shift away again.
+
+def out_of_blocks(a: Shaped[Array, "blocks *s size"], n: int) -> Shaped[Array, "*s n"]:
+    """The inverse: blocks side by side along the last axis, without what filled them up."""
+    a = jnp.moveaxis(a, 0, -2)
+    # Apart from the copy above, which is slow where the compiler makes one of both.
+    a = jax.lax.optimization_barrier(a.reshape(*a.shape[:-2], -1))
+    return a[..., :n]
+
+
+def blockwise(f: Callable, blocks):
+    """`f` on one block after another: memory stays flat.
+
+    In reverse mode each block is computed again from its inputs instead of being stored.
     """
-    diagonal = jnp.diagonal(gram)
-    scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
-    a = gram * scale * scale[:, None]
-    shift = 4 * a.shape[0] * jnp.finfo(a.dtype).eps
-    chol = jnp.linalg.cholesky(a + shift * jnp.eye(a.shape[0], dtype=a.dtype))
-    pivots = jnp.diagonal(chol)
-    condition = (jnp.max(pivots) / jnp.min(pivots)) ** 2
-
-    def solve(b):
-        b = b * scale[:, None]
-        first = jax.scipy.linalg.cho_solve((chol, True), b)
-        second = jax.scipy.linalg.cho_solve((chol, True), b - a @ first)
-        return (first + second) * scale[:, None]
-
-    return solve, condition
-
-
-def blockwise(f: Callable, batch_size: int, *arguments):
-    """`vmap(f)` over the leading axis of all arrays, a block at a time: memory stays flat.
-
-    The last block is filled up with copies of the last row, so that one compiled block serves
-    all. In reverse mode each block is computed again from its inputs instead of being stored.
-    """
-    n = jax.tree.leaves(arguments)[0].shape[0]
-    size = min(batch_size, n)
-    blocks = -(-n // size)
-
-    def split(a):
-        if blocks * size != n:
-            a = a[jnp.minimum(jnp.arange(blocks * size), n - 1)]
-        return a.reshape(blocks, size, *a.shape[1:])
-
-    block = jax.checkpoint(jax.vmap(f))
-    out = jax.lax.map(lambda rows: block(*rows), jax.tree.map(split, arguments))
-    return jax.tree.map(lambda a: a.reshape(blocks * size, *a.shape[2:])[:n], out)
+    return jax.lax.map(jax.checkpoint(f), blocks)

@@ -3,6 +3,7 @@ r"""The differential operators that stencils approximate, as right-hand sides of
 from __future__ import annotations
 
 import abc
+import math
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,9 +29,15 @@ class AbstractTarget(eqx.Module):
     def columns(self, dim: int, high: int) -> list[np.ndarray]:
         """Values of each derivative at 0 on all monomials of degree 0 to `high`."""
 
-    @abc.abstractmethod
-    def assemble(self, weights: Float[Array, "c k"], axes: Float[Array, "t d"]):
-        """Components `(..., k)` in space, from those along the rows of `axes`."""
+    def assemble(
+        self, weights: Float[Array, "c k *p"], axes: Float[Array, "t d *p"]
+    ) -> Float[Array, "... k *p"]:
+        """Components in space from derivatives along the rows of `axes`."""
+        return self.components(weights)
+
+    def components(self, weights: Float[Array, "c k *p"]) -> Float[Array, "... k *p"]:
+        """Components from derivatives along the axes of space."""
+        return weights[0]
 
     def moments(self, dim: int, low: int, high: int) -> np.ndarray:
         """Right-hand sides `(m, c)` for the basis of degree `low` to `high`."""
@@ -46,9 +53,6 @@ class Laplacian(AbstractTarget):
     def columns(self, dim, high):
         return [sum(derivative_at_origin(dim, high, _unit(dim, a, a)) for a in range(dim))]
 
-    def assemble(self, weights, axes):
-        return weights[0]
-
 
 class Gradient(AbstractTarget):
     r"""$\nabla$; d components."""
@@ -59,7 +63,10 @@ class Gradient(AbstractTarget):
         return [derivative_at_origin(dim, high, _unit(dim, a)) for a in range(dim)]
 
     def assemble(self, weights, axes):
-        return axes.T @ weights
+        return jnp.sum(axes[:, :, None] * weights[:, None], axis=0)
+
+    def components(self, weights):
+        return weights
 
 
 class Hessian(AbstractTarget):
@@ -73,11 +80,15 @@ class Hessian(AbstractTarget):
         return [derivative_at_origin(dim, high, _unit(dim, a, b)) for a, b in pairs]
 
     def assemble(self, weights, axes):
-        dim = axes.shape[0]
+        matrix = self.components(weights)
+        half = jnp.sum(axes[:, :, None, None] * matrix[:, None], axis=0)
+        return jnp.sum(axes[:, None, :, None] * half.swapaxes(0, 1)[:, :, None], axis=0)
+
+    def components(self, weights):
+        dim = math.isqrt(2 * len(weights))
         rows, cols = np.triu_indices(dim)
-        full = jnp.zeros((dim, dim, weights.shape[1]), weights.dtype)
-        full = full.at[rows, cols].set(weights).at[cols, rows].set(weights)
-        return jnp.einsum("ap,abk,bq->pqk", axes, full, axes)
+        matrix = jnp.zeros((dim, dim, *weights.shape[1:]), weights.dtype)
+        return matrix.at[rows, cols].set(weights).at[cols, rows].set(weights)
 
 
 class Partial(AbstractTarget):
@@ -91,6 +102,3 @@ class Partial(AbstractTarget):
 
     def columns(self, dim, high):
         return [derivative_at_origin(dim, high, self.alpha)]
-
-    def assemble(self, weights, axes):
-        return weights[0]

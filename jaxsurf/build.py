@@ -1,0 +1,216 @@
+r"""From a cloud to stencils: neighbourhoods chosen, weights in blocks, what is wrong with them."""
+
+from __future__ import annotations
+
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .cloud import PointCloud, is_concrete
+from .neighbors import Neighbors, find_neighbors, nearest_of
+from .stencils.dcpse import DCPSE
+from .stencils.method import AbstractMethod, Diagnostics, Neighborhood
+from .stencils.moments import blockwise, in_blocks, out_of_blocks
+from .stencils.stencil import Stencil
+from .stencils.targets import Laplacian
+
+# A stencil is adapted if the weight of its centre is less than this share of all the others.
+_DOMINANCE = 0.2
+# Sizes of the neighbourhoods of such points, in units of the usual one: tried in turn.
+_SIZES = (1.5, 2.25, 3.4, 0.67, 0.45)
+
+
+def choose_neighbors(
+    cloud: PointCloud,
+    *,
+    method: AbstractMethod = DCPSE(order=2),
+    bound: Bool[Array, " n"] | None = None,
+    throw: bool = True,
+) -> Neighbors:
+    r"""Neighbourhoods suited to a method, of another size where the points are irregular.
+
+    Every point gets the number of neighbours that the method asks for. Where the
+    Laplacian's weight of the centre is then positive or small,
+    $-w_{ii} < 0.2 \sum_{j \ne i} |w_{ij}|$, or its conditions cannot be met, larger
+    neighbourhoods are tried, by half, up to three times, then smaller ones, which see less of a
+    fold. The first that serves is taken; if none does, that with the most dominant centre, on a
+    border the usual one: a one-sided Laplacian has no dominant centre, however large. Such
+    points are what gives collocation matrices eigenvalues with positive real part
+    (`experiments`, stability study).
+
+    Args:
+        cloud: n points in d dimensions with unit normals; concrete.
+        method: how the weights will be computed.
+        bound: True for points that need no stencil, `(n,)`, as a boundary condition gives their
+            values (`Closure.bound`); their rows are switched off and never adapted.
+        throw: passed on to `find_neighbors`.
+
+    Returns:
+        Neighbour lists; rows shorter than the longest are padded.
+    """
+    needed = np.ones(cloud.n, bool) if bound is None else ~np.asarray(bound)
+    neighbors = _adapted(cloud, method, throw, needed)[0]
+    mask = neighbors.mask & jnp.asarray(needed)[:, None]
+    return Neighbors(neighbors.indices, mask, neighbors.radius)
+
+
+def build(cloud, neighbors, method, target, throw) -> Stencil:
+    """The operator of a target, with neighbours chosen if there are none."""
+    weights = None
+    if neighbors is None:
+        neighbors, laplacian = _adapted(cloud, method, throw)
+        if isinstance(target, Laplacian):
+            weights = laplacian
+    _check_sizes(cloud, neighbors, method, target, throw)
+    if weights is None:
+        weights = stencil_weights(cloud, neighbors, method, target)
+    values, diagnostics = weights
+    components = values.shape[1:-1]
+    stencil = Stencil(neighbors.indices.T, values, components, (), diagnostics)
+    if throw and is_concrete(values):
+        _check(stencil, neighbors, method, target, cloud.dim)
+    return stencil
+
+
+@eqx.filter_jit
+def stencil_weights(
+    cloud, neighbors, method, target, rows=None
+) -> tuple[Float[Array, "k *c r"], Diagnostics]:
+    """Weights `(k, *components, r)` and diagnostics of all stencils, or of those of some rows."""
+    rows = jnp.arange(cloud.n) if rows is None else rows
+    size = min(method.batch_size, len(rows))
+    place = in_blocks(rows, size)
+    slots = in_blocks(neighbors.indices.T, size)
+    radius = neighbors.radius
+    # One coordinate at a time: one gather for all of them is slower.
+    offsets = [
+        x - x0[:, None] for x, x0 in zip(*(_columns(cloud.points, i) for i in (slots, place)))
+    ]
+    normals = _columns(cloud.normals, slots)
+    mask = in_blocks(neighbors.mask.T, size)
+    radius = None if radius is None else jnp.broadcast_to(radius, (cloud.n,))[place]
+
+    def weights_of(block):
+        offsets, normals, mask, radius = block
+        offsets, normals = (jnp.stack(columns, axis=1) for columns in (offsets, normals))
+        return method.weights(Neighborhood(offsets, normals, mask, radius), target)
+
+    found = blockwise(weights_of, (offsets, normals, mask, radius))
+    weights, diagnostics = jax.tree.map(lambda a: out_of_blocks(a, len(rows)), found)
+    return jnp.moveaxis(weights, -2, 0), diagnostics
+
+
+def _columns(vectors, slots):
+    """Coordinates of the points named by `slots`."""
+    return [column.at[slots].get(mode="promise_in_bounds") for column in vectors.T]
+
+
+# --- neighbourhoods ------------------------------------------------------------------------
+
+
+def _adapted(cloud, method, throw, needed=True):
+    """Neighbours that suit the method, and the Laplacian's weights and diagnostics with them."""
+    if not is_concrete(*jax.tree.leaves(cloud)):
+        raise ValueError("neighbors=None needs concrete arrays; under jit pass the neighbours")
+    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    available = int(on.sum())
+    k = min(method.neighbor_count(cloud.dim), available)
+    neighbors = find_neighbors(cloud, k, throw=throw)
+    _check_sizes(cloud, neighbors, method, Laplacian(), throw)
+    found = stencil_weights(cloud, neighbors, method, Laplacian())
+    dominance = _dominance(*found)
+    poor = np.flatnonzero(on & needed & (dominance < _DOMINANCE))
+    need = method.basis_size(cloud.dim, Laplacian())
+    sizes = [min(int(k * size), available) for size in _SIZES if k * size > 1.5 * need]
+    if not poor.size or max(sizes) <= k:
+        return neighbors, found
+
+    # Filled up with copies, so that few shapes are ever compiled.
+    rows = np.resize(poor, max(64, 1 << (poor.size - 1).bit_length()))
+    indices, mask = nearest_of(cloud, rows, max(sizes))
+    best, chosen = dominance[rows], np.full(rows.size, k)
+    border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
+    wanted = np.where(border & (dominance > -np.inf), _DOMINANCE, -np.inf)[rows]
+    for size in sizes:
+        some = Neighbors(jnp.asarray(indices), jnp.asarray(mask & _first(size, mask)))
+        trial = stencil_weights(cloud, some, method, Laplacian(), jnp.asarray(rows))
+        now = _dominance(*trial)
+        better = (best < _DOMINANCE) & (now > best) & (now >= wanted)
+        best = np.where(better, now, best)
+        chosen = np.where(better, size, chosen)
+    widest = max(k, chosen.max())
+    mask = (mask & _first(chosen[:, None], mask))[:, :widest]
+    indices = np.where(mask, indices[:, :widest], rows[:, None])
+    adapted = Neighbors(jnp.asarray(indices), jnp.asarray(mask))
+    trial = stencil_weights(cloud, adapted, method, Laplacian(), jnp.asarray(rows))
+
+    more = widest - k
+    own = jnp.broadcast_to(jnp.arange(cloud.n)[:, None], (cloud.n, more))
+    all_indices = jnp.concatenate([neighbors.indices, own.astype(indices.dtype)], axis=1)
+    all_mask = jnp.pad(neighbors.mask, ((0, 0), (0, more)))
+    weights, diagnostics = found
+    put = lambda a, b: a.at[..., rows].set(b)
+    return (
+        Neighbors(all_indices.at[rows].set(indices), all_mask.at[rows].set(mask)),
+        (
+            put(jnp.pad(weights, ((0, more), (0, 0))), trial[0]),
+            jax.tree.map(put, diagnostics, trial[1]),
+        ),
+    )
+
+
+def _first(count, mask: np.ndarray) -> np.ndarray:
+    return np.arange(mask.shape[1]) < count
+
+
+def _dominance(weights, diagnostics) -> np.ndarray:
+    """Share of the centre among the absolute weights of the others; of no use where -inf."""
+    weights, residual = np.asarray(weights), np.asarray(diagnostics.residual)
+    others = np.sum(np.abs(weights[1:]), axis=0)
+    share = np.divide(-weights[0], others, out=np.full(len(others), -np.inf), where=others > 0)
+    return np.where(residual < _tolerance(weights.dtype), share, -np.inf)
+
+
+# --- checks --------------------------------------------------------------------------------
+
+
+def _tolerance(dtype) -> float:
+    """Largest relative moment residual of a stencil that counts as determined."""
+    return float(np.finfo(dtype).eps) ** 0.5
+
+
+def _check_sizes(cloud, neighbors, method, target, throw) -> None:
+    if neighbors.n != cloud.n:
+        raise ValueError(f"neighbours of {neighbors.n} points, the cloud has {cloud.n}")
+    need = method.basis_size(cloud.dim, target)
+    if throw and neighbors.k < need:
+        raise ValueError(f"k = {neighbors.k} neighbours, {method} needs at least {need}")
+
+
+def _check(stencil: Stencil, neighbors, method, target, dim) -> None:
+    diagnostics = stencil.diagnostics
+    assert diagnostics is not None
+    on = np.asarray(neighbors.mask[:, 0])
+    count, residual = np.asarray(diagnostics.count), np.asarray(diagnostics.residual)
+    bad = np.flatnonzero(on & ~(residual < _tolerance(residual.dtype)))
+    if bad.size:
+        i = bad[0]
+        raise ValueError(
+            f"degenerate stencil at point {i}: relative moment residual {residual[i]:.1e} with "
+            f"{count[i]} points within the support {float(diagnostics.support[i]):.3g}, {method} "
+            f"needs at least {method.basis_size(dim, target)} in general position "
+            f"({bad.size} such points)"
+        )
+    tube = np.where(on, np.asarray(diagnostics.tube), 0)
+    if tube.max(initial=0) > 1:
+        i = int(tube.argmax())
+        warnings.warn(
+            f"the surface bends within one stencil: support x curvature = {tube[i]:.2f} at point "
+            f"{i} ({int(np.sum(tube > 1))} points above 1). Use more points there or a smaller "
+            "support",
+            stacklevel=4,
+        )

@@ -157,9 +157,7 @@ def _subspace(system: _System, k: int, degenerate: float, *, left: bool) -> Subs
 
     def compute(system, reference):
         matrix, free = system.to_scipy()
-        space = invariant.subspace(
-            matrix, reference[free].astype(float), k, degenerate, left=left
-        )
+        space = invariant.subspace(matrix, reference[free].astype(float), k, degenerate, left=left)
         return _spread(space, free, n, reference.dtype)
 
     real, whole = reference.dtype, jnp.result_type(int)

@@ -1,0 +1,100 @@
+"""Distances by the heat method: exact ones on the sphere, several sources, gradients, misuse."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsurf as js
+
+from .helpers import check_derivative, jittered_sphere, relative_error
+
+pytest.importorskip("pyamg")
+
+
+def exact_on_sphere(cloud, sources):
+    cosine = jnp.clip(cloud.points @ cloud.points[sources].T, -1, 1)
+    return jnp.min(jnp.arccos(cosine), axis=1).at[sources].set(0)
+
+
+@pytest.mark.parametrize("method", [js.GFDM(degree=2), js.DCPSE(order=2)], ids=str)
+def test_sphere(method):
+    cloud = js.sphere(10_000)
+    source = jnp.array([1234])
+    distance = js.geodesic_distance(cloud, source, method=method)
+    assert relative_error(distance, exact_on_sphere(cloud, source)) < 3e-3
+    assert float(distance[1234]) == 0
+
+
+def test_first_order():
+    def error(n):
+        cloud, source = js.sphere(n), jnp.array([n // 8])
+        return relative_error(js.geodesic_distance(cloud, source), exact_on_sphere(cloud, source))
+
+    assert np.log2(error(1_000) / error(4_000)) > 0.8
+
+
+def test_fronts_that_meet():
+    cloud = jittered_sphere(3_000)
+    sources = jnp.array([0, 1_500, 2_700])
+    exact = exact_on_sphere(cloud, sources)
+    distance = js.geodesic_distance(cloud, sources)
+    assert relative_error(distance, exact) < 2e-2
+    mask = jnp.zeros(cloud.n, bool).at[sources].set(True)
+    np.testing.assert_array_equal(js.geodesic_distance(cloud, mask), distance)
+
+
+def test_a_region_as_source():
+    """The distance from a cap, whose points are all sources."""
+    cloud = js.sphere(4_000)
+    angle = jnp.arccos(jnp.clip(cloud.points[:, 2], -1, 1))
+    distance = js.geodesic_distance(cloud, angle < 0.6)
+    exact = jnp.maximum(angle - angle[angle < 0.6].max(), 0)
+    assert relative_error(distance, exact) < 2e-2
+
+
+def test_scale_and_far_points():
+    """Over 250 spacings heat falls by more than 200 powers of ten."""
+    angle = 2 * jnp.pi * jnp.arange(1_000) / 1_000
+    points = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+    circle = js.PointCloud(points, points)
+    exact = jnp.minimum(angle, 2 * jnp.pi - angle)
+    distance = js.geodesic_distance(circle, jnp.array([0]))
+    assert relative_error(distance, exact) < 1e-3
+    large = js.PointCloud(1e3 * points, points)
+    found = js.geodesic_distance(large, jnp.array([0]))
+    np.testing.assert_allclose(found, 1e3 * distance, rtol=1e-6)
+
+
+def test_gradient_in_the_points():
+    cloud = js.ellipsoid(500, (1.0, 0.8, 0.65))
+    method = js.GFDM(degree=2)
+    neighbors = js.choose_neighbors(cloud, method=method)
+    weight = jnp.asarray(np.random.default_rng(2).normal(size=cloud.n))
+
+    def observed(points):
+        moved = js.PointCloud(points, cloud.normals)
+        distance = js.geodesic_distance(
+            moved, jnp.array([0, 250]), neighbors=neighbors, method=method, rtol=1e-12
+        )
+        return weight @ distance
+
+    check_derivative(observed, cloud.points, step=1e-4)
+
+
+def test_misuse():
+    cloud = js.sphere(300)
+    with pytest.raises(ValueError, match="no sources"):
+        js.geodesic_distance(cloud, jnp.array([], int))
+    with pytest.raises(ValueError, match="source 300 is not among the points 0 to 299"):
+        js.geodesic_distance(cloud, jnp.array([0, 300]))
+    with pytest.raises(ValueError, match=r"mask of sources has shape \(7,\), expected \(300,\)"):
+        js.geodesic_distance(cloud, jnp.zeros(7, bool))
+    with pytest.raises(ValueError, match="sources must be concrete"):
+        jax.jit(lambda s: js.geodesic_distance(cloud, s))(jnp.array([0]))
+    apart = cloud.points + jnp.array([10.0, 0, 0])
+    both = js.PointCloud(
+        jnp.concatenate([cloud.points, apart]), jnp.concatenate([cloud.normals] * 2)
+    )
+    with pytest.raises(ValueError, match=r"no path .* to point 300 \(300 such points\)"):
+        js.geodesic_distance(both, jnp.array([0]))

@@ -20,6 +20,7 @@ from . import (
     e07_bunny_curvature,
     slopes,
     stability,
+    transport,
 )
 from .report import table, write_json
 
@@ -32,6 +33,7 @@ EXPERIMENTS: dict[str, ModuleType] = {
     "accuracy": accuracy,
     "slopes": slopes,
     "stability": stability,
+    "transport": transport,
 }
 
 

@@ -23,6 +23,7 @@ from . import (
     poisson,
     slopes,
     stability,
+    transport,
 )
 from .report import table, write_json
 
@@ -38,6 +39,7 @@ EXPERIMENTS: dict[str, ModuleType] = {
     "poisson": poisson,
     "slopes": slopes,
     "stability": stability,
+    "transport": transport,
 }
 
 

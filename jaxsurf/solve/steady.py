@@ -36,11 +36,11 @@ def solve(
 
     With conditions, $u = E v + e$ and $P A E v = P (f - A e)$ is solved for the free
     values v. Where A annihilates the constants (on a closed surface, or with flux conditions
-    only), a solution exists for one value of the mean of f, so to speak, and is determined up to
-    a constant. It is then found in the mean-zero sense: $A u = f - \lambda$ with the mean of
-    u over all points zero, from the nonsingular system $(A - \sigma 1 m^T) u = f$. The
-    incompatible part $\lambda$ is reported, and is of the size of the discretisation error
-    for a right-hand side that is compatible on the surface.
+    only), a solution exists for right-hand sides of one mean only, and is determined up to a
+    constant. It is then found in the mean-zero sense: $A u = f - \lambda$ with the mean of
+    u over all points zero, through the nonsingular system $(A - \sigma 1 1^T / n) u = f$. The
+    incompatible part $\lambda$ is reported; for a right-hand side that is compatible on the
+    surface it is of the size of the discretisation error.
 
     Args:
         operator: A, a scalar stencil such as `js.laplace_beltrami(...)`, shifted and scaled at

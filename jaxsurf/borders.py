@@ -46,9 +46,10 @@ class Border(eqx.Module):
     mask: Bool[Array, "2 m r"]
 
     @property
-    def corners(self) -> Bool[Array, " m"]:
-        """True where two smooth pieces meet."""
-        return jnp.any(self.rows[0] != self.rows[1], axis=1)
+    def corners(self) -> Bool[np.ndarray, " m"]:
+        """True where two smooth pieces meet; on the host, also while the cloud is traced."""
+        before, after = np.asarray(self.rows)
+        return np.any(before != after, axis=1)
 
     def conormals(self, cloud: PointCloud) -> Float[Array, "m d"]:
         """Outward unit conormals; at a corner the mean direction of both sides."""

@@ -23,7 +23,6 @@ from . import (
     poisson,
     slopes,
     stability,
-    transport,
 )
 from .report import table, write_json
 
@@ -39,7 +38,6 @@ EXPERIMENTS: dict[str, ModuleType] = {
     "poisson": poisson,
     "slopes": slopes,
     "stability": stability,
-    "transport": transport,
 }
 
 

@@ -11,6 +11,9 @@ from jaxsurf.solve import inverse
 
 from .helpers import central_difference, check_derivative, jittered_sphere
 
+# Minutes in all.
+pytestmark = pytest.mark.slow
+
 _SPHERE = np.repeat([0.0, 2.0, 6.0, 12.0, 20.0], [1, 3, 5, 7, 9])
 
 

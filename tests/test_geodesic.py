@@ -9,6 +9,9 @@ import jaxsurf as js
 
 from .helpers import check_derivative, jittered_sphere, relative_error
 
+# Minutes in all.
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("pyamg")
 
 

@@ -10,6 +10,9 @@ import pytest
 import jaxsurf as js
 from jaxsurf.time.implicit import _IMEX, _SDIRK
 
+# Minutes in all.
+pytestmark = pytest.mark.slow
+
 CLOUD = js.sphere(300)
 LAPLACIAN = js.laplace_beltrami(CLOUD)
 SOLVERS = [

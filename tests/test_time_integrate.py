@@ -11,6 +11,9 @@ import pytest
 
 import jaxsurf as js
 
+# Minutes in all.
+pytestmark = pytest.mark.slow
+
 CLOUD = js.sphere(300)
 LAPLACIAN = js.laplace_beltrami(CLOUD)
 Z = CLOUD.points[:, 2]
@@ -155,76 +158,6 @@ def test_right_hand_side_that_is_not_finite():
     problem = js.AdvectionDiffusionReaction(LAPLACIAN, reaction=lambda t, u, args: jnp.log(u))
     with pytest.raises(ValueError, match=r"right-hand side at point \d+ is not finite"):
         js.integrate(problem, Z, t1=1.0)
-
-
-# --- files ---------------------------------------------------------------------------------
-
-TIMES = jnp.array([0.01, 0.1, 0.25, 0.5])
-KINDS = {
-    "adaptive RKC2": dict(rtol=1e-7, atol=1e-9),
-    "constant steps": dict(dt0=0.01),
-    "adaptive IMEX": dict(solver=js.IMEX(order=3), rtol=1e-7, atol=1e-9),
-}
-
-
-class Stop(Exception):
-    pass
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_run_that_was_killed_goes_on_bit_by_bit(kind, tmp_path, monkeypatch):
-    u0 = jnp.exp(CLOUD.points[:, 0])
-    reaction = lambda t, u, args: jnp.sin(9 * t) * u
-    problem = js.AdvectionDiffusionReaction(LAPLACIAN, reaction=reaction)
-    settings = KINDS[kind] | dict(t1=0.5, saveat=dfx.SaveAt(t0=True, ts=TIMES, t1=True))
-
-    def run(name, every=7):
-        return js.integrate(
-            problem, u0, checkpoint=js.Checkpoint(tmp_path / name, every), **settings
-        )
-
-    whole = run("whole", every=10_000)
-    plain = js.integrate(problem, u0, **settings)
-
-    import jaxsurf.time.checkpoint as module
-
-    write, count = module._write, 0
-
-    def write_and_die(*args):
-        nonlocal count
-        write(*args)
-        count += 1
-        if count == 2:
-            raise Stop
-
-    monkeypatch.setattr(module, "_write", write_and_die)
-    with pytest.raises(Stop):
-        run("killed")
-    monkeypatch.undo()
-    resumed = run("killed")
-    for name in ("num_steps", "num_accepted_steps"):
-        assert int(resumed.stats[name]) == int(whole.stats[name]) == int(plain.stats[name]) > 14
-    np.testing.assert_array_equal(resumed.ys, whole.ys)
-    np.testing.assert_array_equal(resumed.ts, whole.ts)
-    np.testing.assert_allclose(plain.ys, whole.ys, rtol=1e-12)
-    np.testing.assert_array_equal(plain.ts, whole.ts)
-    # What is finished is read, not computed again.
-    again = run("killed")
-    np.testing.assert_array_equal(again.ys, whole.ys)
-
-
-def test_files_of_other_runs_are_refused(tmp_path):
-    file = js.Checkpoint(tmp_path / "run.npz", every=5)
-    js.integrate(HEAT, Z, t1=0.1, checkpoint=file)
-    with pytest.raises(ValueError, match="checkpoint of another run"):
-        js.integrate(HEAT, 2 * Z, t1=0.1, checkpoint=file)
-    (tmp_path / "run.npz").write_text("not an archive")
-    with pytest.raises(ValueError, match="does not hold a checkpoint"):
-        js.integrate(HEAT, Z, t1=0.1, checkpoint=file)
-    with pytest.raises(ValueError, match="at t0, t1 and given times only"):
-        js.integrate(HEAT, Z, t1=0.1, checkpoint=file, saveat=dfx.SaveAt(steps=True))
-    with pytest.raises(ValueError, match="every = 0"):
-        js.Checkpoint("x", every=0)
 
 
 # --- long runs -----------------------------------------------------------------------------

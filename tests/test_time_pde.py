@@ -11,6 +11,9 @@ import jaxsurf as js
 
 from .helpers import jittered_sphere, relative_error
 
+# Minutes in all.
+pytestmark = pytest.mark.slow
+
 CLOUD = js.sphere(600)
 METHOD = js.DCPSE(order=4)
 NEIGHBORS = js.choose_neighbors(CLOUD, method=METHOD)

@@ -76,7 +76,7 @@ def geodesic_distance(
         >>> bool(jnp.linalg.norm(distance - exact) < 0.02 * jnp.linalg.norm(exact))
         True
     """
-    sources = _source_indices(sources, cloud.n)
+    sources = _source_indices(sources, cloud.n)  # type: ignore[assignment]
     if neighbors is None:
         neighbors = choose_neighbors(cloud, method=method)
     elif not is_concrete(neighbors.indices, neighbors.mask):

@@ -2,12 +2,12 @@ r"""Invariant subspaces of a sparse matrix near zero, on the host, with NumPy an
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Complex, Float, Int
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs, gmres
 
 from .inverse import Inverse
@@ -36,15 +36,15 @@ class Subspace(NamedTuple):
         scale: a typical eigenvalue.
     """
 
-    values: Float[Array, " K"]
-    imaginary: Float[Array, " K"]
-    groups: Int[Array, " K"]
-    right: Float[Array, "n K"]
-    left: Float[Array, "n K"]
-    block: Float[Array, "K K"]
-    mix: Complex[Array, "K K"]
-    unmix: Complex[Array, "K K"]
-    scale: Float[Array, ""]
+    values: Float[Any, " K"]
+    imaginary: Float[Any, " K"]
+    groups: Int[Any, " K"]
+    right: Float[Any, "n K"]
+    left: Float[Any, "n K"]
+    block: Float[Any, "K K"]
+    mix: Complex[Any, "K K"]
+    unmix: Complex[Any, "K K"]
+    scale: Float[Any, ""]
 
 
 def subspace(
@@ -162,7 +162,7 @@ def sylvester(
         real = abs(mu[j].imag) == 0 and not np.any(column.imag)
         m, b = (mu[j].real, column.real) if real else (mu[j], column)
         solution[:, j] += _complement(inverse, m, b, v, w, rtol)
-    return (solution @ unmix).real
+    return np.real(solution @ unmix)
 
 
 def _complement(inverse, mu, rhs, v, w, rtol):

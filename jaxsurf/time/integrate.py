@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, PyTree
 
-from .checkpoint import Checkpoint, integrate_in_parts
 from .pde import AbstractEvolution
 from .run import Run
 
@@ -50,7 +49,6 @@ def integrate(
     event: dfx.Event | None = None,
     progress: bool = False,
     adjoint: dfx.AbstractAdjoint | None = None,
-    checkpoint: Checkpoint | None = None,
     args: Any = None,
     max_steps: int | None = None,
     throw: bool = True,
@@ -74,7 +72,6 @@ def integrate(
         progress: show a progress bar.
         adjoint: how to differentiate; by default reverse mode with 64 copies of the state
             however many the steps. `diffrax.ForwardMode()` for forward mode.
-        checkpoint: a file to write every so many steps, and to go on from: see `Checkpoint`.
         args: handed to reactions and forcings.
         max_steps: by default ten million, or 4,096 where every step is stored.
         throw: raise if the end is not reached; if False, see `Solution.result`.
@@ -105,10 +102,6 @@ def integrate(
     saveat = dfx.SaveAt(t1=True) if saveat is None else saveat
     if max_steps is None:
         max_steps = _STORED_STEPS if _stores_steps(saveat) else _MANY_STEPS
-    if checkpoint is not None:
-        saveat = _closed(saveat, run.problem)
-        solution = integrate_in_parts(run, checkpoint, saveat, event, max_steps, progress)
-        return _finished(run, solution, throw)
     solution = dfx.diffeqsolve(
         run.terms,
         run.solver,

@@ -189,11 +189,13 @@ def _source_indices(sources, n: int) -> Int[np.ndarray, " m"]:
 
 
 def _spacing(cloud, neighbors) -> Float[Array, ""]:
-    r"""$\sqrt{2\pi\,\overline{r^2} / k}$: the k neighbours fill a disk of k h²."""
+    """The spacing h at which k neighbours fill a disk of area k h², or a piece k h of a curve."""
     count = jnp.sum(neighbors.mask, axis=1)
     offset = cloud.points[neighbors.indices] - cloud.points[:, None]
-    square = jnp.sum(jnp.where(neighbors.mask, jnp.sum(offset**2, axis=2), 0), axis=1)
-    return jnp.sqrt(jnp.mean(2 * math.pi * square / count**2))
+    square = jnp.sum(jnp.where(neighbors.mask, jnp.sum(offset**2, axis=2), 0), axis=1) / count
+    return jnp.sqrt(
+        jnp.mean(12 * square / count**2 if cloud.dim == 2 else 2 * math.pi * square / count)
+    )
 
 
 @eqx.filter_jit
@@ -233,7 +235,7 @@ def _arcs(cloud, near, owners):
     """
     x, n = cloud.points, cloud.normals
     squares = jnp.sum((x[near][:, None] - x[owners]) ** 2, axis=2)
-    source = owners[np.arange(len(near)), jnp.argmin(squares, axis=1)]
+    source = jnp.asarray(owners)[np.arange(len(near)), jnp.argmin(squares, axis=1)]
     chord = x[near] - x[source]
     at_source = source == near
     length = jnp.sqrt(jnp.where(at_source, 1, jnp.sum(chord**2, axis=1)))

@@ -12,6 +12,9 @@ import jaxsurf as js
 
 from .helpers import check_derivative
 
+# Minutes in all.
+pytestmark = pytest.mark.slow
+
 A = jnp.array([0.9, -0.6, 0.5])
 
 
@@ -221,7 +224,6 @@ def test_poisson_with_one_sided_stencils(method, kind, bound, least):
     assert np.log2(errors[0] / errors[1]) > least
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["dirichlet", "neumann", "robin"])
 @pytest.mark.parametrize("make", [square, cap, annulus], ids=lambda f: f.__name__)
 def test_poisson_with_ghosts(make, kind):
@@ -275,7 +277,6 @@ def test_images_of_a_sphere_lie_on_it():
 # --- stability -----------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["dirichlet", "neumann"])
 @pytest.mark.parametrize("way", [one_sided, mirrored], ids=lambda f: f.__name__)
 @pytest.mark.parametrize("make", [square, annulus], ids=lambda f: f.__name__)

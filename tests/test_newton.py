@@ -11,6 +11,9 @@ import jaxsurf as js
 
 from .helpers import check_derivative
 
+# Minutes in all.
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def problem():

@@ -13,6 +13,9 @@ from jaxsurf.solve.reduced import annihilates_constants, reduced_matrix
 
 from .helpers import random_sphere
 
+# Minutes in all.
+pytestmark = pytest.mark.slow
+
 
 def _fields(n, count=2, seed=0):
     return [jnp.asarray(v) for v in np.random.default_rng(seed).normal(size=(count, n))]

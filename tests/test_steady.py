@@ -12,6 +12,9 @@ from jaxsurf.solve.system import Inverse, System
 
 from .helpers import check_derivative, exponential, relative_error
 
+# Minutes in all.
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def sphere():

@@ -10,6 +10,9 @@ import pytest
 import jaxsurf as js
 from jaxsurf.time.chebyshev import table
 
+# Minutes in all.
+pytestmark = pytest.mark.slow
+
 CLOUD = js.sphere(300)
 NEIGHBORS = js.choose_neighbors(CLOUD)
 LAPLACIAN = js.laplace_beltrami(CLOUD, NEIGHBORS)

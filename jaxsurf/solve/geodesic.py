@@ -60,9 +60,8 @@ def geodesic_distance(
         Distances, `(n,)`, zero at the sources.
 
     Accuracy: relative l2 error 2e-3 on the sphere at n = 10,000, first order on other surfaces
-    (`python -m experiments run geodesics`).
-    Differentiable: forward and reverse, in points and normals, for fixed neighbours; nearest
-    sources are taken as they are.
+    (`tests/test_geodesic.py`). Not yet shown for methods above second order.
+    Differentiable: meant to be, in points and normals, for fixed neighbours; not yet verified.
     Raises:
         ValueError: no source; a source that is no point; a point that no path leads to (on
             concrete arrays).

@@ -188,7 +188,7 @@ def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
             raise ValueError("the mesh has no border edges")
         paths = [(loop, True) for loop in mesh.border_loops]
         return _with_rows(cloud, paths)
-    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    on = cloud.host_active
     marked = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary) & on
     if not marked.any():
         raise ValueError("no point is marked in cloud.boundary; see detect_border")
@@ -235,7 +235,7 @@ def detect_border(cloud: PointCloud, *, k: int = _RING, gap: float = _GAP) -> Bo
         raise ValueError(f"k = {k} neighbours, expected 3 to {cloud.n}")
     if not 0 < gap < np.pi:
         raise ValueError(f"gap = {gap}, expected an angle between 0 and π")
-    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    on = cloud.host_active
     rows = np.flatnonzero(on)
     points, normals = np.asarray(cloud.points, float)[rows], np.asarray(cloud.normals)[rows]
     k = min(k, len(rows)) if cloud.dim == 3 else 3

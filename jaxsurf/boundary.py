@@ -22,7 +22,7 @@ import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
 from .borders import Border, find_border
-from .build import stencil_weights
+from .build import residual_tolerance, stencil_weights
 from .cloud import PointCloud, is_concrete
 from .conditions import Condition, checked_conditions
 from .neighbors import Neighbors, nearest_of
@@ -31,7 +31,7 @@ from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil
 from .stencils.targets import Gradient
 
-# The pivot a + b w_i has to be more than this share of the sizes it is the sum of.
+# The factor of an unknown value has to be more than this share of its terms.
 _PIVOT = 1e-3
 
 
@@ -201,7 +201,7 @@ def close(
     """
     conditions, owner = checked_conditions(cloud, conditions)
     bound = np.concatenate([c.where[own] for c, own in zip(conditions, owner)])
-    free = np.ones(cloud.n, bool) if cloud.active is None else np.array(cloud.active)
+    free = cloud.host_active.copy()
     free[bound] = False
     dtype = cloud.points.dtype
 
@@ -223,7 +223,9 @@ def close(
             if throw and is_concrete(w, a, b):
                 size = np.abs(a) + np.abs(b) * np.abs(w).sum(axis=0)
                 _check_stencils(rows, near, diagnostics.residual, method, cloud.dim)
-                _check_pivots(rows, np.asarray(pivot), np.asarray(size))
+                check_pivots(
+                    np.asarray(pivot), np.asarray(size), rows, "value at point {i}: a + b w_i"
+                )
         parts.append((rows, slots, weights / pivot))
         place = jnp.arange(start, start + m)
         sources.append(Source(place, 1 / pivot, jnp.asarray(np.flatnonzero(own)), condition))
@@ -295,7 +297,7 @@ def _free_neighbors(cloud, rows, free, neighbors, method) -> Neighbors:
 
 def _nearest_free(cloud, rows, free, k):
     """The k nearest of own point and free points, from as many candidates as it takes."""
-    available = cloud.n if cloud.active is None else int(np.asarray(cloud.active).sum())
+    available = int(cloud.host_active.sum())
     count = min(2 * k, available)
     while True:
         indices, mask = nearest_of(cloud, rows, count)
@@ -315,7 +317,7 @@ def _compacted(indices, mask, k=None):
 
 def _check_stencils(rows, near, residual, method, dim) -> None:
     residual = np.asarray(residual)
-    bad = np.flatnonzero(~(residual < float(np.finfo(residual.dtype).eps) ** 0.5))
+    bad = np.flatnonzero(~(residual < residual_tolerance(residual.dtype)))
     if bad.size:
         i = bad[0]
         raise ValueError(
@@ -325,11 +327,19 @@ def _check_stencils(rows, near, residual, method, dim) -> None:
         )
 
 
-def _check_pivots(rows, pivot, size) -> None:
-    bad = np.flatnonzero(~(np.abs(pivot) > _PIVOT * size))
+def check_pivots(pivot, terms, points, what: str) -> None:
+    """Refuse what a condition determines by a difference of nearly equal terms.
+
+    Args:
+        pivot: the factor of the unknown value, `(m,)`.
+        terms: sum of the absolute terms that the factor consists of, `(m,)`.
+        points: for the message, `(m,)`.
+        what: the unknown with `{i}` for its point, and the factor's formula.
+    """
+    bad = np.flatnonzero(~(np.abs(pivot) > _PIVOT * terms))
     if bad.size:
         i = bad[0]
         raise ValueError(
-            f"the condition does not determine the value at point {rows[i]}: a + b w_i = "
-            f"{pivot[i]:.1e}, |a| + |b| sum |w_j| = {size[i]:.1e} ({bad.size} such points)"
+            f"the condition does not determine the {what.format(i=points[i])} = {pivot[i]:.1e}, "
+            f"its terms add up to {terms[i]:.1e} in modulus ({bad.size} such points)"
         )

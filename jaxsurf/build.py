@@ -116,7 +116,7 @@ def _adapted(cloud, method, throw, needed=True):
     """Neighbours that suit the method, and the Laplacian's weights and diagnostics with them."""
     if not is_concrete(*jax.tree.leaves(cloud)):
         raise ValueError("neighbors=None needs concrete arrays; under jit pass the neighbours")
-    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    on = cloud.host_active
     available = int(on.sum())
     k = min(method.neighbor_count(cloud.dim), available)
     neighbors = find_neighbors(cloud, k, throw=throw)
@@ -172,13 +172,13 @@ def _dominance(weights, diagnostics) -> np.ndarray:
     weights, residual = np.asarray(weights), np.asarray(diagnostics.residual)
     others = np.sum(np.abs(weights[1:]), axis=0)
     share = np.divide(-weights[0], others, out=np.full(len(others), -np.inf), where=others > 0)
-    return np.where(residual < _tolerance(weights.dtype), share, -np.inf)
+    return np.where(residual < residual_tolerance(weights.dtype), share, -np.inf)
 
 
 # --- checks --------------------------------------------------------------------------------
 
 
-def _tolerance(dtype) -> float:
+def residual_tolerance(dtype) -> float:
     """Largest relative moment residual of a stencil that counts as determined."""
     return float(np.finfo(dtype).eps) ** 0.5
 
@@ -196,7 +196,7 @@ def _check(stencil: Stencil, neighbors, method, target, dim) -> None:
     assert diagnostics is not None
     on = np.asarray(neighbors.mask[:, 0])
     count, residual = np.asarray(diagnostics.count), np.asarray(diagnostics.residual)
-    bad = np.flatnonzero(on & ~(residual < _tolerance(residual.dtype)))
+    bad = np.flatnonzero(on & ~(residual < residual_tolerance(residual.dtype)))
     if bad.size:
         i = bad[0]
         raise ValueError(

@@ -49,7 +49,7 @@ class PointCloud(eqx.Module):
         active: Bool[Array, " n"] | None = None,
         spacing: Float[Array, " n"] | None = None,
     ):
-        self.points = _as_float(points)
+        self.points = as_float(points)
         self.normals = jnp.asarray(normals, self.points.dtype)
         self.boundary = None if boundary is None else jnp.asarray(boundary, bool)
         self.active = None if active is None else jnp.asarray(active, bool)
@@ -69,7 +69,7 @@ class PointCloud(eqx.Module):
             self._check_values()
 
     def _check_values(self):
-        on = np.ones(self.n, bool) if self.active is None else np.asarray(self.active)
+        on = self.host_active
         points, normals = np.asarray(self.points), np.asarray(self.normals)
         raise_at(on & ~np.isfinite(points).all(axis=1), "point {i} is not finite: {v}", points)
         length = np.linalg.norm(normals, axis=1)
@@ -90,12 +90,18 @@ class PointCloud(eqx.Module):
         """Dimension d of the space around the surface: 2 or 3."""
         return self.points.shape[1]
 
+    @property
+    def host_active(self) -> Bool[np.ndarray, " n"]:
+        """Which rows are switched on, as a NumPy array; concrete clouds only."""
+        return np.ones(self.n, bool) if self.active is None else np.asarray(self.active)
+
     def permuted(self, order: Int[Array, " n"]) -> PointCloud:
         """The same cloud with row `order[i]` in place i."""
         return jax.tree.map(lambda a: a[order], self)
 
 
-def _as_float(x) -> Float[Array, "..."]:
+def as_float(x) -> Float[Array, "..."]:
+    """The array as it is if it is of a floating-point type, else in the default one."""
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
 

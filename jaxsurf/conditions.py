@@ -149,7 +149,7 @@ def checked_conditions(
     conditions = [conditions] if isinstance(conditions, Condition) else list(conditions)
     if not conditions:
         raise ValueError("no conditions given")
-    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    on = cloud.host_active
     owner, place = np.full(cloud.n, -1), np.zeros(cloud.n, int)
     owned = []
     for number, condition in enumerate(conditions):

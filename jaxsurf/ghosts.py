@@ -22,7 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from .borders import Border, find_border
-from .boundary import Closure, Source
+from .boundary import Closure, Source, check_pivots
 from .cloud import PointCloud, is_concrete
 from .conditions import Condition, checked_conditions
 from .stencils.dcpse import DCPSE
@@ -30,8 +30,6 @@ from .stencils.method import AbstractMethod
 
 # An image closer than this share of the spacing to another point is left out.
 _CLOSE = 0.5
-# a/2 + b/2s has to be more than this share of the sizes it is the sum of.
-_PIVOT = 1e-3
 
 
 def with_ghosts(
@@ -155,7 +153,7 @@ def _reach(cloud, border, method, depth) -> Float[np.ndarray, " m"]:
         if not depth > 0:
             raise ValueError(f"depth = {depth}, expected a positive length")
         return np.full(m, float(depth))
-    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    on = cloud.host_active
     points = np.asarray(cloud.points, float)
     half = method.neighbor_count(cloud.dim) / 2
     count = np.where(np.asarray(border.corners), half / 2, half).astype(int) + 1
@@ -169,7 +167,7 @@ def _reach(cloud, border, method, depth) -> Float[np.ndarray, " m"]:
 
 def _reflected(cloud, border, owner, reach) -> _Images:
     """Images across every piece of the border, and next to corners images of images."""
-    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    on = cloud.host_active
     names = np.flatnonzero(on)
     points, normals = np.asarray(cloud.points)[names], np.asarray(cloud.normals)[names]
     pieces = _pieces(border)
@@ -267,7 +265,7 @@ def _sides(border: Border, piece, slot) -> Int[np.ndarray, " p"]:
 
 def _apart(cloud, images) -> Bool[np.ndarray, " m"]:
     """Images that are not too close to points, or to images before them."""
-    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    on = cloud.host_active
     points = np.asarray(cloud.points, float)[on]
     tree = cKDTree(points)
     distance, nearest = tree.query(images.points)
@@ -299,7 +297,8 @@ def _enlarged(cloud, images, conditions, owned, place, throw) -> tuple[PointClou
         if condition.b is not None:
             b = _carried(condition.b, condition.m, pick, share) / (2 * images.distance[here])
         if throw and is_concrete(a, b):
-            _check_factor(np.asarray(a + b), np.asarray(abs(a) + abs(b)), root[here])
+            terms = np.asarray(abs(a) + abs(b))
+            check_pivots(np.asarray(a + b), terms, root[here], "image of point {i}: a/2 + b/2s")
         weight = weight.at[here].set((b - a) / (a + b))
         inverse = inverse.at[here].set(1 / (a + b))
     total = jnp.where(second, weight * weight[parent], weight)
@@ -385,13 +384,3 @@ def _joined(cloud, images) -> PointCloud:
         active=pad(cloud.active, True),
         spacing=None if spacing is None else jnp.concatenate([spacing, spacing[root]]),
     )
-
-
-def _check_factor(factor, size, root) -> None:
-    bad = np.flatnonzero(~(np.abs(factor) > _PIVOT * size))
-    if bad.size:
-        i = bad[0]
-        raise ValueError(
-            f"the condition does not determine the image of point {root[i]}: a/2 + b/2s = "
-            f"{factor[i]:.1e}, |a|/2 + |b|/2s = {size[i]:.1e} ({bad.size} such points)"
-        )

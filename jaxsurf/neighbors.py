@@ -113,7 +113,7 @@ def find_neighbors(
     surface = isinstance(cloud, PointCloud)
     if not isinstance(cloud, PointCloud):
         cloud = PointCloud(cloud, jnp.zeros_like(cloud).at[:, 0].set(1))
-    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    on = cloud.host_active
     rows = np.flatnonzero(on)
     points = np.asarray(cloud.points)[rows]
     normals = np.asarray(cloud.normals)[rows]
@@ -179,7 +179,7 @@ def nearest_of(
         Indices and mask, `(r, k)`; rows may come in any order and more than once.
     """
     rows = np.asarray(rows)
-    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    on = cloud.host_active
     names = np.flatnonzero(on)
     check_count(k, len(names))
     points, normals = np.asarray(cloud.points)[names], np.asarray(cloud.normals)[names]

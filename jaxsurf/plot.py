@@ -182,7 +182,7 @@ class _Scene(NamedTuple):
 
     @staticmethod
     def of(cloud: PointCloud, view, up, pixels: int) -> _Scene:
-        on = _on(cloud)
+        on = cloud.host_active
         points, normals = np.asarray(cloud.points, float)[on], np.asarray(cloud.normals, float)[on]
         if not len(points):
             raise ValueError("nothing to draw: no point is switched on")
@@ -193,12 +193,8 @@ class _Scene(NamedTuple):
         return _Scene(points, normals, raster)
 
 
-def _on(cloud: PointCloud) -> np.ndarray:
-    return np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
-
-
 def _checked(field, cloud: PointCloud) -> np.ndarray:
-    values, on = np.asarray(field, float), _on(cloud)
+    values, on = np.asarray(field, float), cloud.host_active
     if values.shape != (cloud.n,):
         raise ValueError(f"field has shape {values.shape}, expected ({cloud.n},)")
     raise_at(on & ~np.isfinite(values), "field is {v} at point {i}", values)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .stencils.stencil import AbstractOperator
+from .stencils.stencil import AbstractOperator, check_scalar
 
 
 class Spectrum(NamedTuple):
@@ -52,9 +52,7 @@ def spectral_estimate(operator: AbstractOperator, *, steps: int = 40, degree: in
         >>> bool(spectrum.abscissa < 1e-6 * spectrum.radius)
         True
     """
-    if operator.in_shape or operator.out_shape:
-        shapes = f"{operator.in_shape} to {operator.out_shape}"
-        raise ValueError(f"an operator on scalar fields is needed, not from {shapes} components")
+    check_scalar(operator)
     start = jnp.asarray(np.random.default_rng(0).normal(size=operator.n))
     steps = min(steps, operator.n - 1)
     radius = float(np.abs(_ritz_values(operator, operator, start, steps)).max())

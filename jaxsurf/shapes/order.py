@@ -76,7 +76,7 @@ def sort_cloud(cloud: PointCloud) -> tuple[PointCloud, np.ndarray]:
     """
     if not is_concrete(cloud.points, cloud.active):
         raise ValueError("sorting needs a concrete cloud: sort before entering jit or grad")
-    on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+    on = cloud.host_active
     rows = np.flatnonzero(on)
     order = np.concatenate([rows[sort_points(np.asarray(cloud.points)[rows])], np.flatnonzero(~on)])
     return cloud.permuted(jnp.asarray(order)), order

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..cloud import is_concrete
-from ..stencils.stencil import AbstractOperator
+from ..stencils.stencil import AbstractOperator, check_scalar
 from . import invariant
 from .invariant import Subspace
 
@@ -85,9 +85,7 @@ def eigenmodes(
         >>> bool(jnp.allclose(modes.values, jnp.array([0.0, 2.0, 2.0, 2.0]), atol=0.01))
         True
     """
-    if operator.in_shape or operator.out_shape:
-        shapes = f"{operator.in_shape} to {operator.out_shape}"
-        raise ValueError(f"an operator on scalar fields is needed, not from {shapes} components")
+    check_scalar(operator)
     if not 1 <= k <= operator.n // 2:
         raise ValueError(f"k = {k} modes, between 1 and n / 2 = {operator.n // 2} can be computed")
     system = _System.of(operator, conditions)

@@ -16,11 +16,10 @@ from jaxtyping import Array, Float
 
 from ..boundary import Closure
 from ..cloud import is_concrete
-from ..stencils.stencil import AbstractOperator, Stencil
+from ..stencils.stencil import AbstractOperator, Stencil, check_scalar
 from .krylov import BiCGStab
 from .padded import matching_layout
 from .precondition import AbstractPreconditioner, multigrid
-from .reduced import check_scalar
 from .system import Inverse, System
 
 # A step is accepted if the residual falls by this share of what the linear model promises.

@@ -156,14 +156,11 @@ class Incoming(eqx.Module):
                 "the preconditioner was made for other neighbours than the operator has: make it "
                 "for this operator",
             )
-        n = stencil.n
-        own = stencil.indices == jnp.arange(n, dtype=stencil.indices.dtype)
-        diagonal = jnp.sum(jnp.where(own, weights, 0), axis=0)
         values = weights.reshape(-1)
         fill = lambda place: values.at[place].get(mode="fill", fill_value=0)
         table = self.table
         extra = (table.rows, table.others, fill(table.sources))
-        return PaddedMatrix(table.columns, fill(table.source), diagonal, extra)
+        return PaddedMatrix(table.columns, fill(table.source), stencil.diagonal, extra)
 
 
 # Of a stencil; of the factors of a composition; None where it is not known.

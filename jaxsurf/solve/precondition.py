@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 
 from ..boundary import Closure
 from ..cloud import is_concrete
-from ..stencils.stencil import AbstractOperator, Composition, Stencil
+from ..stencils.stencil import AbstractOperator, Composition, Stencil, check_scalar
 from .padded import Layout, PaddedMatrix, incoming_layout
-from .reduced import annihilates_constants, check_scalar, reduced_matrix
+from .reduced import annihilates_constants, reduced_matrix
 
 # The coarsest system has at most this many unknowns and is solved by a dense inverse.
 _COARSEST = 400
@@ -172,8 +172,7 @@ def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> 
     if not isinstance(operator, Stencil):
         raise ValueError(f"the diagonal of a {type(operator).__name__} is not at hand")
     check_scalar(operator)
-    own = operator.indices == jnp.arange(operator.n, dtype=operator.indices.dtype)
-    diagonal = jnp.sum(jnp.where(own, operator.weights, 0), axis=0)
+    diagonal = operator.diagonal
     if conditions is not None:
         diagonal = jnp.where(conditions.bound, 1, diagonal)
     incoming = incoming_layout(operator) if is_concrete(operator.indices) else None

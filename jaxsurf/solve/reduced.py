@@ -8,7 +8,6 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 from ..cloud import is_concrete
-from ..stencils.stencil import Stencil
 
 # Row sums up to this many times round-off are those of an operator that annihilates constants.
 _ROUNDOFF = 32
@@ -26,7 +25,7 @@ def reduced_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
             "multigrid is set up on concrete arrays: call js.multigrid outside jit and grad, "
             "and pass its result as `preconditioner`"
         )
-    matrix = _compressed(operator) if isinstance(operator, Stencil) else operator.to_scipy()
+    matrix = operator.to_scipy()
     if not np.isfinite(matrix.data).all():
         i = np.searchsorted(matrix.indptr, np.argmin(np.isfinite(matrix.data)), "right") - 1
         raise ValueError(f"the operator has weights that are not finite, first at point {i}")
@@ -46,18 +45,6 @@ def reduced_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
             f"row {empty[0]} of the operator is zero ({empty.size} such rows): nothing "
             "determines the value there"
         )
-    return matrix
-
-
-def _compressed(stencil) -> scipy.sparse.csr_matrix:
-    """The matrix of a scalar stencil; rows are in the order of the slots, which is fast."""
-    k, n = stencil.indices.shape
-    columns, weights = (
-        np.ascontiguousarray(np.asarray(a).T).ravel() for a in (stencil.indices, stencil.weights)
-    )
-    pointers = np.arange(0, k * n + 1, k, dtype=np.int32)
-    matrix = scipy.sparse.csr_matrix((weights, columns, pointers), shape=(n, n))
-    matrix.eliminate_zeros()
     return matrix
 
 
@@ -92,9 +79,3 @@ def annihilates_constants(matrix, conditions=None) -> bool:
         f"the one of {size[i]} points around point {int(np.argmax(part == i))} the solution is "
         "determined up to a constant only. Solve the parts one by one, or prescribe a value there"
     )
-
-
-def check_scalar(operator) -> None:
-    if operator.in_shape or operator.out_shape:
-        shapes = f"{operator.in_shape} to {operator.out_shape}"
-        raise ValueError(f"an operator on scalar fields is needed, not from {shapes} components")

@@ -11,11 +11,11 @@ from jaxtyping import Array, Float
 
 from ..boundary import Closure
 from ..cloud import is_concrete
-from ..stencils.stencil import AbstractOperator
+from ..stencils.stencil import AbstractOperator, check_scalar
 from .krylov import BiCGStab
 from .padded import matching_layout
 from .precondition import AbstractPreconditioner, multigrid
-from .reduced import annihilates_constants, check_scalar, reduced_matrix
+from .reduced import annihilates_constants, reduced_matrix
 from .system import Inverse, System
 
 

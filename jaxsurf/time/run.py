@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from ..cloud import is_concrete, raise_at
+from ..cloud import as_float, is_concrete, raise_at
 from .chebyshev import Loop
 from .explicit import RKC2
 from .implicit import IMEX
@@ -81,7 +81,7 @@ class Run(eqx.Module):
 
     @classmethod
     def of(cls, problem, u0, t0, t1, solver, dt0, rtol, atol, controller, adjoint, args) -> Run:
-        u0 = jax.tree.map(_as_float, u0)
+        u0 = jax.tree.map(as_float, u0)
         real = jnp.finfo(jnp.result_type(*jax.tree.leaves(u0))).dtype
         t0, t1 = jnp.asarray(t0, real), jnp.asarray(t1, real)
         dt0 = None if dt0 is None else jnp.asarray(dt0, real)
@@ -158,11 +158,6 @@ class Guarded(dfx.AbstractStepSizeController):
 
 
 # --- checks --------------------------------------------------------------------------------
-
-
-def _as_float(x) -> Array:
-    x = jnp.asarray(x)
-    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
 
 
 def _check_times(t0, t1, dt0) -> None:

@@ -20,9 +20,12 @@ from . import (
     e05_poisson_sphere,
     e06_ellipsoid_curvature,
     e07_bunny_curvature,
+    geodesics,
     poisson,
     slopes,
     stability,
+    transport,
+    turing,
 )
 from .report import table, write_json
 
@@ -35,9 +38,12 @@ EXPERIMENTS: dict[str, ModuleType] = {
     "E6": e06_ellipsoid_curvature,
     "E7": e07_bunny_curvature,
     "accuracy": accuracy,
+    "geodesics": geodesics,
     "poisson": poisson,
     "slopes": slopes,
     "stability": stability,
+    "transport": transport,
+    "turing": turing,
 }
 
 

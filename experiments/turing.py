@@ -1,4 +1,4 @@
-r"""Turing patterns of Schnakenberg's reaction: their onset on the sphere, and what grows on the bunny.
+r"""Turing patterns of Schnakenberg's reaction: onset on the sphere, and what grows on the bunny.
 
 $$\partial_t u = \ell^2 \Delta_S u + a - u + u^2 v, \qquad
   \partial_t v = d\,\ell^2 \Delta_S v + b - u^2 v$$

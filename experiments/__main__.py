@@ -13,6 +13,7 @@ import matplotlib
 
 from . import (
     accuracy,
+    cahn_hilliard,
     e01_circle_laplacian,
     e02_sphere_laplacian,
     e03_closest_point,
@@ -26,6 +27,7 @@ from . import (
     stability,
     transport,
     turing,
+    waves,
 )
 from .report import table, write_json
 
@@ -38,12 +40,14 @@ EXPERIMENTS: dict[str, ModuleType] = {
     "E6": e06_ellipsoid_curvature,
     "E7": e07_bunny_curvature,
     "accuracy": accuracy,
+    "cahn-hilliard": cahn_hilliard,
     "geodesics": geodesics,
     "poisson": poisson,
     "slopes": slopes,
     "stability": stability,
     "transport": transport,
     "turing": turing,
+    "waves": waves,
 }
 
 
@@ -61,7 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     if options.command == "list":
         for name, module in EXPERIMENTS.items():
-            print(f"{name:10s} {module.TITLE}")
+            print(f"{name:13s} {module.TITLE}")
         return 0
     known = {name.lower(): name for name in EXPERIMENTS}
     unknown = [name for name in options.names if name.lower() not in known]

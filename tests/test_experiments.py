@@ -49,6 +49,24 @@ def test_run_prints_and_writes_what_it_measured(tmp_path):
     assert (tmp_path / "new" / "E1.png").stat().st_size > 5_000
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cahn-hilliard", "geodesics", "transport", "turing", "waves"])
+def test_applications_keep_their_bounds(name, tmp_path):
+    done = _run("run", name, "--quick", "--out", tmp_path)
+    if "skipped" in done.stdout:
+        pytest.skip(done.stdout.splitlines()[-1])
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = json.loads((tmp_path / f"{name}.json").read_text())["rows"]
+    assert sum(row["holds"] is True for row in rows) >= 3
+    assert all(row["holds"] is not False for row in rows)
+    assert next(tmp_path.glob("*.png")).stat().st_size > 20_000
+
+
+def test_bounds_of_numpy_numbers():
+    """Their comparisons are not the `False` that a failure is counted by."""
+    assert Row("e", np.float64(2.0), bound=1.0).holds is False
+
+
 def test_unknown_names_are_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
         command.main(["run", "E1", "E99", "--out", str(tmp_path / "none")])

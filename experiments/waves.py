@@ -1,9 +1,8 @@
 r"""Waves: a standing wave on the sphere, and a drop on the Armadillo.
 
 $\partial_t^2 u = \Delta_S u$. On the unit sphere $\cos(\omega t)\,Y$ with Y a harmonic of degree l
-and $\omega^2 = l (l + 1)$ is a solution. On the Armadillo
-there is none to compare with, but the energy
-$\tfrac12 \int (\partial_t u)^2 + |\nabla_S u|^2 \, dA$ must not grow.
+and $\omega^2 = l (l + 1)$ is a solution. On the Armadillo there is none to compare with,
+but the energy $\tfrac12 \int (\partial_t u)^2 + |\nabla_S u|^2 \, dA$ must not grow.
 
 How far this goes: collocation Laplacians are not symmetric, and where a scan is coarse some of
 their eigenvalues are complex: modes of middling length in folds and claws, which grow as waves

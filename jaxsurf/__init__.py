@@ -81,6 +81,7 @@ from .stencils.method import Diagnostics as Diagnostics
 from .stencils.stencil import AbstractOperator as AbstractOperator
 from .stencils.stencil import Composition as Composition
 from .stencils.stencil import Stencil as Stencil
+from .time.checkpoint import Checkpoint as Checkpoint
 from .time.explicit import RKC2 as RKC2
 from .time.implicit import IMEX as IMEX
 from .time.implicit import SDIRK as SDIRK

@@ -240,7 +240,6 @@ def test_poisson_with_ghosts(make, kind):
     assert np.log2(errors[0] / errors[1]) > 1.5
 
 
-@pytest.mark.xfail(strict=True, reason="images of images at corners: open")
 def test_even_and_odd_images_of_symmetric_fields():
     cloud = square(11)
     x, y = cloud.points[:, 0], cloud.points[:, 1]
@@ -310,7 +309,6 @@ def test_derivatives_of_the_closure(what):
     check_derivative(lambda x: closed_value(**{what: x}), start)
 
 
-@pytest.mark.xfail(strict=True, reason="ghosts cannot be placed for traced clouds yet")
 def test_derivatives_of_images():
     def f(x):
         a, b, g = x

@@ -21,9 +21,12 @@ from . import (
     e06_ellipsoid_curvature,
     e07_bunny_curvature,
     e08_bump,
+    geodesics,
     poisson,
     slopes,
     stability,
+    transport,
+    turing,
 )
 from .report import table, write_json
 
@@ -37,9 +40,12 @@ EXPERIMENTS: dict[str, ModuleType] = {
     "E7": e07_bunny_curvature,
     "E8": e08_bump,
     "accuracy": accuracy,
+    "geodesics": geodesics,
     "poisson": poisson,
     "slopes": slopes,
     "stability": stability,
+    "transport": transport,
+    "turing": turing,
 }
 
 

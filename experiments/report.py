@@ -49,7 +49,7 @@ class Row:
             return None
         if not math.isfinite(self.ours):
             return False
-        return self.ours >= self.bound if self.at_least else self.ours <= self.bound
+        return bool(self.ours >= self.bound if self.at_least else self.ours <= self.bound)
 
     def as_json(self) -> dict[str, Any]:
         return {

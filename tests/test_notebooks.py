@@ -13,7 +13,7 @@ _NEEDED = f"needs {', '.join(_MISSING)}: pip install 'jaxsurf[notebooks]'"
 
 
 def test_there_are_notebooks():
-    assert [path.name for path in _NOTEBOOKS] == ["quickstart.ipynb"]
+    assert [path.name for path in _NOTEBOOKS] == ["patterns.ipynb", "quickstart.ipynb"]
 
 
 @pytest.mark.skipif(bool(_MISSING), reason=_NEEDED)

@@ -43,8 +43,9 @@ def geodesic_distance(
       shortest path along neighbours, $v = e^{p / \sqrt t} u$ is solved for instead, by
       Jacobi's iteration, whose terms do not cancel: every v gets its digits.
     - The gradient is integrated as differences,
-      $\sum_j (d_j - d_i) = \sum_j (x_j - x_i)\cdot(X_i + X_j) / 2$ over the neighbours j of i,
-      which where two fronts meet and X jumps needs no divergence of it.
+      $\sum_j (d_j - d_i) = \sum_j b_{ij} (x_j - x_i)\cdot(X_i + X_j) / 2$ over the neighbours j
+      of i, which where two fronts meet and X jumps needs no divergence of it. The factors b make
+      up for chords that are shorter than arcs and directions that are not along them.
     - Next to the sources the distance is prescribed: that along the circular arc that fits both
       points and their normals. So a corner in the distance is not differentiated.
 
@@ -165,7 +166,7 @@ def _integrate(cloud, neighbors, direction, near, distance, rtol):
     fall with the rank of a neighbour: as they depend on nothing but the lists, neither does the
     preconditioner. (With equal ones no connection would count as strong in multigrid.)
     """
-    x = cloud.points
+    x, normals = cloud.points, cloud.normals
     with jax.ensure_compile_time_eval():  # of the lists alone, also where points are traced
         indices, mask = neighbors.indices.T, neighbors.mask.T.at[0].set(False)
         rank = jnp.cumsum(mask, axis=0) / (1 + jnp.sum(mask, axis=0))
@@ -177,14 +178,26 @@ def _integrate(cloud, neighbors, direction, near, distance, rtol):
 
     def add_slot(total, slot):
         j, w = slot
-        step = jnp.sum((x[j] - x) * (direction + direction[j]), axis=1) / 2
-        return total - w * step, None
+        chord = x[j] - x
+        step = jnp.sum(chord * (direction + direction[j]), axis=1) / 2
+        return total - w * _bent(chord, normals[j] - normals) * step, None
 
     rhs, _ = jax.lax.scan(add_slot, jnp.zeros(cloud.n, x.dtype), (indices, share))
     conditions = close(cloud, dirichlet(near, distance))
     return solve(
         differences, rhs, conditions=conditions, preconditioner=preconditioner, rtol=rtol
     ).value
+
+
+def _bent(chord, turn):
+    r"""Length of an arc over its chord times the cosine between the two.
+
+    A circle through two points turns by $2\theta$, $\sin\theta = a = (n_j - n_i)\cdot e / 2$ with e
+    along the chord: $\theta / (\sin\theta\cos\theta) = 1 + 2 a^2 / 3 + 8 a^4 / 15 + \dots$
+    """
+    square = jnp.sum(chord**2, axis=1)
+    a2 = jnp.sum(turn * chord, axis=1) ** 2 / (4 * jnp.where(square == 0, 1, square))
+    return 1 + a2 * (2 / 3 + a2 * (8 / 15))
 
 
 def _source_indices(sources, n: int) -> Int[np.ndarray, " m"]:

@@ -93,6 +93,7 @@ from .time.pde import AdvectionDiffusionReaction as AdvectionDiffusionReaction
 from .time.pde import BiharmonicDiffusion as BiharmonicDiffusion
 from .time.pde import CahnHilliard as CahnHilliard
 from .time.pde import WaveEquation as WaveEquation
+from .time.preconditioned import step_preconditioner as step_preconditioner
 from .time.run import choose_solver as choose_solver
 from .time.stabilize import hyperviscosity as hyperviscosity
 from .time.stabilize import upwinding as upwinding

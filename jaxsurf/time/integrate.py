@@ -233,7 +233,7 @@ def _reason(run: Run, solution: dfx.Solution, t: float, state) -> str:
         ),
         (
             dfx.RESULTS.nonlinear_divergence,
-            "a step diverged, needed more stages than allowed, or its equations have no solution",
+            "a step diverged, needed more stages than allowed, or a system in it was not solved",
         ),
     )
     reason = next((text for code, text in why if solution.result == code), None)

@@ -81,6 +81,7 @@ from .stencils.method import Diagnostics as Diagnostics
 from .stencils.stencil import AbstractOperator as AbstractOperator
 from .stencils.stencil import Composition as Composition
 from .stencils.stencil import Stencil as Stencil
+from .time.checkpoint import Checkpoint as Checkpoint
 from .time.explicit import RKC2 as RKC2
 from .time.implicit import IMEX as IMEX
 from .time.implicit import SDIRK as SDIRK
@@ -92,6 +93,7 @@ from .time.pde import AdvectionDiffusionReaction as AdvectionDiffusionReaction
 from .time.pde import BiharmonicDiffusion as BiharmonicDiffusion
 from .time.pde import CahnHilliard as CahnHilliard
 from .time.pde import WaveEquation as WaveEquation
+from .time.preconditioned import step_preconditioner as step_preconditioner
 from .time.run import choose_solver as choose_solver
 from .time.stabilize import hyperviscosity as hyperviscosity
 from .time.stabilize import upwinding as upwinding

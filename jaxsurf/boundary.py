@@ -176,15 +176,19 @@ def close(
         conditions: one or several; together they may name a point twice only if they agree.
         neighbors: lists for all n points, of which the free ones are used; if None, the
             nearest free points are searched for (host only).
-        method: how the derivatives are computed; of the operator's order or one above.
+        method: how the derivatives are computed; of the operator's order or one above. GFDM
+            serves DC-PSE operators too, and better: one-sided DC-PSE is 20 to 40 times less
+            accurate.
         border: from `find_border`, for conormals on traced points; found where needed if None.
         throw: check stencils and pivots (on concrete arrays).
 
     Returns:
         The map from free values to fields that meet the conditions.
 
-    Accuracy: bound values O(h^{p+1}) for GFDM(degree=p) and DCPSE(order=p)
-    (`tests/test_boundary.py`).
+    Accuracy: bound values O(h^{p+1}) for GFDM(degree=p) and DCPSE(order=p). Largest relative
+        error of a screened Poisson problem with flux conditions on a spherical cap of 1,600
+        points: 1.6e-3 GFDM(2), 1.5e-5 GFDM(4), 6e-4 DCPSE(2) closed by GFDM(3), 1.3e-5 DCPSE(4)
+        closed by GFDM(4), with the orders of the operators (`tests/test_boundary.py`).
     Differentiable: forward and reverse, in points, normals, values, a, b and conormals, for
     fixed neighbours.
     Raises:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -83,13 +84,15 @@ def with_ghosts(
     if not is_concrete(cloud.points, cloud.normals, cloud.boundary, cloud.active):
         raise ValueError("with_ghosts needs concrete points: images are found on the host")
     conditions, owned = checked_conditions(cloud, conditions)
-    border = find_border(cloud) if border is None else border
+    with jax.ensure_compile_time_eval():  # of the points alone; values may be traced
+        border = find_border(cloud) if border is None else border
     owner, place = np.full(cloud.n, -1), np.zeros(cloud.n, int)
     for number, (condition, own) in enumerate(zip(conditions, owned)):
         owner[condition.where[own]], place[condition.where[own]] = number, np.flatnonzero(own)
     _check_places(conditions, owned, border)
 
-    images = _reflected(cloud, border, owner, _reach(cloud, border, method, depth))
+    with jax.ensure_compile_time_eval():
+        images = _reflected(cloud, border, owner, _reach(cloud, border, method, depth))
     if not len(images.parent):
         raise ValueError("no border point is under a condition: there is nothing to reflect")
     images = images.only(_apart(cloud, images), cloud.n)
@@ -220,17 +223,20 @@ class _Across:
         row, used = (np.asarray(x)[side, slot] for x in (self.border.rows, self.border.mask))
         end = all_points[spots[slot]]
         beside = used & (row != spots[slot][:, None])
-        inner = all_points[row[np.arange(len(row)), np.argmax(beside, axis=1)]]
+        inner = row[np.arange(len(row)), np.argmax(beside, axis=1)]
         is_end = np.asarray(self.border.corners)[slot]
-        beyond = is_end & (np.einsum("pd,pd->p", foot - end, end - inner) > 1e-9 * distance[near])
+        past = np.einsum("pd,pd->p", foot - end, end - all_points[inner])
+        beyond = is_end & (past > 1e-9 * distance[near])
         keep = inside > 1e-3 * distance[near]
         keep &= ~beyond if corners is None else beyond
 
-        condition = self.owner[spots[slot]]
-        # Values of another condition say nothing here; the nearest point then speaks alone.
+        # A corner may be under the condition of the other side.
+        speaker = np.where(is_end & (self.owner[inner] >= 0), inner, spots[slot])
+        condition = self.owner[speaker]
+        # Values of another condition say nothing here; one point then speaks alone.
         shared = np.all(~used | (self.owner[row] == condition[:, None]), axis=1)
         alone = np.arange(row.shape[1]) == 0
-        carriers = np.where(shared[:, None], row, spots[slot][:, None])
+        carriers = np.where(shared[:, None], row, speaker[:, None])
         shares = np.where(shared[:, None], share, alone)
         step = 2 * inside[:, None] * conormal
         turned = normals - 2 * np.einsum("pd,pd->p", normals, conormal)[:, None] * conormal

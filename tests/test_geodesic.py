@@ -78,20 +78,21 @@ def test_scale_and_far_points():
     np.testing.assert_allclose(found, 1e3 * distance, rtol=1e-6)
 
 
-def test_gradient_in_the_points():
+def test_gradient_in_points_and_normals():
     cloud = js.ellipsoid(500, (1.0, 0.8, 0.65))
     method = js.GFDM(degree=2)
     neighbors = js.choose_neighbors(cloud, method=method)
     weight = jnp.asarray(np.random.default_rng(2).normal(size=cloud.n))
 
-    def observed(points):
-        moved = js.PointCloud(points, cloud.normals)
+    def observed(both):
+        normals = both[1] / jnp.linalg.norm(both[1], axis=1, keepdims=True)
+        moved = js.PointCloud(both[0], normals)
         distance = js.geodesic_distance(
             moved, np.array([0, 250]), neighbors=neighbors, method=method, rtol=1e-12
         )
         return weight @ distance
 
-    check_derivative(observed, cloud.points, step=1e-4)
+    check_derivative(observed, jnp.stack([cloud.points, cloud.normals]), step=1e-4)
 
 
 def test_misuse():

@@ -172,7 +172,7 @@ def test_derivatives(solver):
 def test_linear_systems_that_are_not_solved_are_reported():
     u0 = jnp.exp(CLOUD.points[:, 2])
     weak = js.IMEX(order=3, solver=lx.BiCGStab(rtol=0.0, atol=1e-10, max_steps=2), tolerance=1e-10)
-    with pytest.raises(js.IntegrationError, match="linear system") as caught:
+    with pytest.raises(js.IntegrationError, match="a system in it was not solved") as caught:
         js.integrate(js.AdvectionDiffusionReaction(LAPLACIAN), u0, t1=1.0, dt0=0.5, solver=weak)
     assert caught.value.time == 0.0
     np.testing.assert_array_equal(caught.value.state, u0)

@@ -160,6 +160,89 @@ def test_right_hand_side_that_is_not_finite():
         js.integrate(problem, Z, t1=1.0)
 
 
+# --- files ---------------------------------------------------------------------------------
+
+TIMES = jnp.array([0.01, 0.1, 0.25, 0.5])
+KINDS = {
+    "adaptive RKC2": dict(rtol=1e-7, atol=1e-9),
+    "constant steps": dict(dt0=0.01),
+    "adaptive IMEX": dict(solver=js.IMEX(order=3), rtol=1e-7, atol=1e-9),
+}
+
+
+class Stop(Exception):
+    pass
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_that_was_killed_goes_on_bit_by_bit(kind, tmp_path, monkeypatch):
+    u0 = jnp.exp(CLOUD.points[:, 0])
+    reaction = lambda t, u, args: jnp.sin(9 * t) * u
+    problem = js.AdvectionDiffusionReaction(LAPLACIAN, reaction=reaction)
+    settings = KINDS[kind] | dict(t1=0.5, saveat=dfx.SaveAt(t0=True, ts=TIMES, t1=True))
+
+    def run(name):
+        checkpoint = js.Checkpoint(tmp_path / name, every=0.12)
+        return js.integrate(problem, u0, checkpoint=checkpoint, **settings)
+
+    whole = run("whole")
+    plain = js.integrate(problem, u0, **settings)
+
+    import jaxsurf.time.checkpoint as module
+
+    write, count = module._write, 0
+
+    def write_and_die(*args):
+        nonlocal count
+        write(*args)
+        count += 1
+        if count == 2:
+            raise Stop
+
+    monkeypatch.setattr(module, "_write", write_and_die)
+    with pytest.raises(Stop):
+        run("killed")
+    monkeypatch.undo()
+    resumed = run("killed")
+    for name in ("num_steps", "num_accepted_steps"):
+        assert int(resumed.stats[name]) == int(whole.stats[name]) >= int(plain.stats[name])
+    np.testing.assert_array_equal(resumed.ys, whole.ys)
+    np.testing.assert_array_equal(resumed.ts, whole.ts)
+    np.testing.assert_array_equal(whole.ts, plain.ts)
+    # Parts end with steps of their own: equal to the tolerance, not to the bit.
+    np.testing.assert_allclose(whole.ys, plain.ys, rtol=2e-5)
+    # What is finished is read, not computed again.
+    again = run("killed")
+    np.testing.assert_array_equal(again.ys, whole.ys)
+
+
+def test_a_checkpointed_run_that_ends_early(tmp_path):
+    checkpoint = js.Checkpoint(tmp_path / "run.npz", every=4.0)
+    saveat = dfx.SaveAt(ts=jnp.array([1.0, 999.0]), t1=True)
+    solution = js.integrate(
+        HEAT, 1 + Z, t1=1e3, event=js.steady_state(), checkpoint=checkpoint, saveat=saveat
+    )
+    assert solution.result == dfx.RESULTS.event_occurred
+    assert np.isinf(solution.ts[1]) and 4 < float(solution.ts[2]) < 24
+    np.testing.assert_allclose(solution.ys[0], 1 + jnp.exp(-2.0) * Z, atol=5e-3)
+    np.testing.assert_allclose(solution.ys[2], 1.0, atol=1e-3)
+
+
+def test_files_of_other_runs_are_refused(tmp_path):
+    file = js.Checkpoint(tmp_path / "run.npz", every=0.05)
+    js.integrate(HEAT, Z, t1=0.1, checkpoint=file)
+    for changed in (dict(u0=2 * Z), dict(rtol=1e-5), dict(solver=js.IMEX(order=2))):
+        with pytest.raises(ValueError, match="checkpoint of another run"):
+            js.integrate(HEAT, **(dict(u0=Z, t1=0.1, checkpoint=file) | changed))
+    (tmp_path / "run.npz").write_text("not an archive")
+    with pytest.raises(ValueError, match="does not hold a checkpoint"):
+        js.integrate(HEAT, Z, t1=0.1, checkpoint=file)
+    with pytest.raises(ValueError, match="at t0, t1 and given times only"):
+        js.integrate(HEAT, Z, t1=0.1, checkpoint=file, saveat=dfx.SaveAt(steps=True))
+    with pytest.raises(ValueError, match="every = 0"):
+        js.Checkpoint("x", every=0)
+
+
 # --- long runs -----------------------------------------------------------------------------
 
 

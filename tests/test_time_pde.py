@@ -155,7 +155,8 @@ def test_cahn_hilliard_separates_keeps_its_mass_and_loses_energy():
         float(weights @ ((u**2 - 1) ** 2 / 4 - 0.5 * width**2 * u * laplacian(u))) for u in ys
     ]
     assert energy[0] > energy[1] > energy[2] > energy[3]
-    assert float(ys[-1].max()) > 0.8 and float(ys[-1].min()) < -0.7
+    # From 0.05; the interface is a fifth of the way round, so that neither phase is pure.
+    assert float(ys[-1].max()) > 0.7 and float(ys[-1].min()) < -0.7
     mass = ys @ weights
     np.testing.assert_allclose(mass, mass[0], rtol=1e-13)
     # The two ways to write the right-hand side are one.

@@ -41,7 +41,7 @@ def plan(quick: bool) -> list[tuple[str, list]]:
         for name in cases.METHODS
         for reverse in (False, True)
     ]
-    return [*todo, ("retraces", []), *heat.plan(quick)]
+    return [*todo, ("retraces", [])]
 
 
 def run_case(name: str, arguments: list) -> dict:
@@ -120,6 +120,7 @@ def table(results: list[dict], quick: bool) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m experiments.benchmarks", description=__doc__)
+    parser.add_argument("group", nargs="?", default="stencils", choices=["stencils", "heat"])
     parser.add_argument("--quick", action="store_true", help="smaller sizes")
     parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR")
     parser.add_argument("--readme", action="store_true", help="put the table into the README")
@@ -133,11 +134,15 @@ def main() -> None:
         print(json.dumps(case(*json.loads(arguments))))
         return
     results = []
-    for name, arguments in tqdm(plan(options.quick), desc="benchmarks", unit="case"):
+    todo = heat.plan(options.quick) if options.group == "heat" else plan(options.quick)
+    for name, arguments in tqdm(todo, desc="benchmarks", unit="case"):
         result = run_case(name, arguments)
         results.append({"case": name, "arguments": arguments, "result": result})
     options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "benchmarks.json").write_text(json.dumps(results, indent=1))
+    (options.out / f"{options.group}.json").write_text(json.dumps(results, indent=1))
+    if options.group == "heat":
+        print(json.dumps(results, indent=1))
+        return
     text = table(results, options.quick)
     (options.out / "benchmarks.md").write_text(text + "\n")
     print(text)

@@ -3,7 +3,7 @@ r"""Distances along a surface by the heat method."""
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ from ..operators import laplace_beltrami, surface_gradient
 from ..stencils.gfdm import GFDM
 from ..stencils.method import AbstractMethod
 from ..stencils.stencil import Stencil
-from .precondition import jacobi, multigrid
+from .precondition import multigrid
 from .steady import solve
 
 
@@ -65,8 +65,7 @@ def geodesic_distance(
     more points: heat for a time of the size of h² is not resolved, whatever h. Where fronts meet
     first order: 7e-3 from five sources (`tests/test_geodesic.py`,
     `python -m experiments run geodesics`). Not yet shown for methods above second order.
-    Differentiable: forward and reverse, in points and normals, for fixed neighbours and sources
-    (`tests/test_geodesic.py::test_gradient_in_the_points`; in the points only).
+    Differentiable: forward and reverse, in points and normals, for fixed neighbours.
     Raises:
         ValueError: no source; a source that is no point; a point that no path leads to (on
             concrete arrays).
@@ -107,7 +106,7 @@ def geodesic_distance(
 
     heat = rescaled(laplacian).scaled(-(spacing**2)).shifted(1.0)
     start = jnp.zeros(cloud.n, cloud.points.dtype).at[sources].set(1)
-    v = _relaxed(heat, start, rtol)
+    v = _warm(heat, start, rtol)
     flow = -rescaled(gradient)(v)
 
     near, owners = _around(np.asarray(neighbors.indices), sources)
@@ -117,33 +116,49 @@ def geodesic_distance(
     return _integrate(cloud, neighbors, direction, near, distance, rtol)
 
 
-def _relaxed(operator: Stencil, rhs, rtol: float):
-    """Solve by Jacobi's iteration until no entry changes by more than the share rtol of itself.
+def _warm(heat: Stencil, start, rtol: float):
+    """The solution of the rescaled heat equation, positive everywhere, and its derivative.
+
+    Once the values are known, the operator is rescaled by them too: the solution is then one
+    everywhere, and derivatives, which have both signs, are of like size at all points.
+    """
+    known, given = jax.lax.stop_gradient((heat, start))
+    values = _relaxed(known, given, known.diagonal, jnp.abs, rtol)
+    ratio = values[heat.indices] / values
+    near_one = eqx.tree_at(lambda s: s.weights, heat, heat.weights * ratio)
+    diagonal = jax.lax.stop_gradient(near_one.diagonal)
+    # Zero; what is left of it is the derivative of the equation at its solution.
+    rest = start / values - near_one(jnp.ones_like(values))
+    rest = rest - jax.lax.stop_gradient(rest)
+
+    def solve(matvec, b):
+        largest = lambda x: jnp.max(jnp.abs(x))
+        return _relaxed(matvec, b, diagonal, largest, rtol)
+
+    return values * (1 + jax.lax.custom_linear_solve(near_one, rest, solve, solve))
+
+
+def _relaxed(operator: Callable, rhs, diagonal, size: Callable, rtol: float):
+    """Solve by Jacobi's iteration until no entry changes by more than the share rtol of a size.
 
     It takes about two steps for every spacing between the source and the farthest point.
     """
-    diagonal = jacobi(operator).diagonal
-    limit = 1000 + 20 * math.isqrt(operator.n)
+    limit = 1000 + 20 * math.isqrt(len(rhs))
 
-    def solve(matvec, b):
-        def step(carry):
-            x, _, count = carry
-            change = (b - matvec(x)) / diagonal
-            return x + change, jnp.any(jnp.abs(change) > rtol * jnp.abs(x)), count + 1
+    def step(carry):
+        x, _, count = carry
+        change = (rhs - operator(x)) / diagonal
+        return x + change, jnp.any(jnp.abs(change) > rtol * size(x)), count + 1
 
-        start = b / diagonal, jnp.array(True), jnp.array(0)
-        goes_on = lambda carry: carry[1] & (carry[2] < limit)
-        x, unfinished, _ = jax.lax.while_loop(goes_on, step, start)
-        return eqx.error_if(
-            x,
-            unfinished,
-            (
-                f"heat from the sources has not converged in {limit} steps of Jacobi's iteration, "
-                "which needs a method of second order, with weights of one sign"
-            ),
-        )
-
-    return jax.lax.custom_linear_solve(operator, rhs, solve, solve)
+    start = rhs / diagonal, jnp.array(True), jnp.array(0)
+    goes_on = lambda carry: carry[1] & (carry[2] < limit)
+    x, unfinished, _ = jax.lax.while_loop(goes_on, step, start)
+    return eqx.error_if(
+        x,
+        unfinished,
+        f"heat from the sources has not converged in {limit} steps of Jacobi's iteration, which "
+        "needs a method of second order, with weights of one sign",
+    )
 
 
 def _integrate(cloud, neighbors, direction, near, distance, rtol):
@@ -154,14 +169,13 @@ def _integrate(cloud, neighbors, direction, near, distance, rtol):
     preconditioner. (With equal ones no connection would count as strong in multigrid.)
     """
     x, normals = cloud.points, cloud.normals
-    bound: Any = np.asarray(near)  # a JAX array made of them under `jit` would be traced
-    with jax.ensure_compile_time_eval():
+    with jax.ensure_compile_time_eval():  # of the lists alone, also where points are traced
         indices, mask = neighbors.indices.T, neighbors.mask.T.at[0].set(False)
         rank = jnp.cumsum(mask, axis=0) / (1 + jnp.sum(mask, axis=0))
         share = jnp.where(mask, (1 - rank) ** 3, 0).astype(x.dtype)
         share = share / jnp.sum(share, axis=0)
         differences = Stencil(indices, (-share).at[0].set(1))
-        fixed = close(cloud, dirichlet(bound, 0.0))
+        fixed = close(cloud, dirichlet(near, 0.0))
         preconditioner = multigrid(differences, conditions=fixed)
 
     def add_slot(total, slot):
@@ -171,7 +185,7 @@ def _integrate(cloud, neighbors, direction, near, distance, rtol):
         return total - w * _bent(chord, normals[j] - normals) * step, None
 
     rhs, _ = jax.lax.scan(add_slot, jnp.zeros(cloud.n, x.dtype), (indices, share))
-    conditions = close(cloud, dirichlet(bound, distance))
+    conditions = close(cloud, dirichlet(near, distance))
     return solve(
         differences, rhs, conditions=conditions, preconditioner=preconditioner, rtol=rtol
     ).value

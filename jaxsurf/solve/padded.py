@@ -95,6 +95,12 @@ class PaddedMatrix(eqx.Module):
         weights = jnp.asarray(values[table.source])
         return cls(jnp.asarray(table.columns), weights, diagonal, extra)
 
+    def minus(self, factor, other: PaddedMatrix) -> PaddedMatrix:
+        """This matrix less a number times another of the same layout."""
+        weights = self.weights - factor * other.weights
+        extra = self.extra[2] - factor * other.extra[2]
+        return PaddedMatrix(self.indices, weights, None, (*self.extra[:2], extra))
+
     def __call__(self, x: Float[Array, " p"]) -> Float[Array, " m"]:
         k, m = self.indices.shape
         take = lambda j: x.at[j].get(mode="promise_in_bounds")

@@ -227,10 +227,10 @@ def multigrid(
         constant[np.asarray(conditions.rows)] = 0
     fine = matrix
     while fine.shape[0] > _COARSEST:
-        aggregated = _aggregated(fine, constant)
-        if aggregated is None:
+        found = aggregate(fine, constant)
+        if found is None:
             break
-        tentative, constant = aggregated
+        tentative, constant = found
         level, fine = _level(fine, tentative, dtype)
         levels.append(level)
     if fine.shape[0] > 4 * _COARSEST:
@@ -244,7 +244,7 @@ def multigrid(
 # --- set-up on the host --------------------------------------------------------------------
 
 
-def _aggregated(matrix, constant):
+def aggregate(matrix, constant):
     """Tentative prolongation and the coarse constants; None if nothing can be aggregated."""
     try:
         from pyamg.aggregation import fit_candidates, standard_aggregation
@@ -268,16 +268,9 @@ def _level(matrix, tentative, dtype):
     if np.any(diagonal == 0):
         i = int(np.flatnonzero(diagonal == 0)[0])
         raise ValueError(f"the diagonal of the operator is zero in row {i}: nothing to smooth with")
-    # At points with a small diagonal (few, badly placed neighbours) plain Jacobi steps would
-    # diverge. Half the sum of a row's moduli, the diagonal where weights are of one sign,
-    # keeps the row sums of D⁻¹A below 2.
-    half = np.add.reduceat(np.abs(matrix.data), matrix.indptr[:-1]) / 2
-    inverse = np.sign(diagonal) / np.maximum(np.abs(diagonal), half)
-    radius = _radius(matrix, inverse)
-    # (I - w D⁻¹ A) T
-    damped = matrix.copy()
-    damped.data *= np.repeat(-4 / 3 / radius * inverse, np.diff(matrix.indptr))
-    prolong = (tentative + damped @ tentative).tocsr()
+    inverse = 1 / divisor(matrix)
+    radius = jacobi_radius(matrix, inverse)
+    prolong = smoothed(matrix, tentative, inverse, radius)
     restrict = prolong.T.tocsr()
     pad = lambda a: PaddedMatrix.from_scipy(a, dtype)
     level = Level(
@@ -286,12 +279,32 @@ def _level(matrix, tentative, dtype):
         jnp.asarray(inverse.astype(dtype)),
         pad(restrict),
         pad(prolong),
-        _chebyshev(radius, dtype),
+        chebyshev(radius, dtype),
     )
     return level, (restrict @ (matrix @ prolong)).tocsr()
 
 
-def _radius(matrix, inverse, steps: int = 8) -> float:
+def divisor(matrix) -> np.ndarray:
+    """What Jacobi's steps divide by.
+
+    At points with a small diagonal (few, badly placed neighbours) plain ones would diverge. Half
+    the sum of a row's moduli, the diagonal where weights are of one sign, keeps the row sums of
+    D⁻¹A below 2.
+    """
+    diagonal = matrix.diagonal()
+    return np.sign(diagonal) * np.maximum(
+        np.abs(diagonal), abs(matrix) @ np.full(len(diagonal), 0.5)
+    )
+
+
+def smoothed(matrix, tentative, inverse, radius) -> scipy.sparse.csr_matrix:
+    """Prolongation after a step of Jacobi's, (I - w D⁻¹ A) T."""
+    damped = matrix.copy()
+    damped.data *= np.repeat(-4 / 3 / radius * inverse, np.diff(matrix.indptr))
+    return (tentative + damped @ tentative).tocsr()
+
+
+def jacobi_radius(matrix, inverse, steps: int = 8) -> float:
     """Spectral radius of D⁻¹A by the power method; a few per cent too small."""
     v = np.random.default_rng(0).normal(size=matrix.shape[0])
     for _ in range(steps):
@@ -301,7 +314,7 @@ def _radius(matrix, inverse, steps: int = 8) -> float:
     return float(size)
 
 
-def _chebyshev(radius, dtype, degree: int = 2):
+def chebyshev(radius, dtype, degree: int = 2) -> tuple[Float[Array, ""], ...]:
     """Step sizes at the roots of the Chebyshev polynomial on the upper part of the spectrum."""
     low, high = _SMOOTHED * radius, 1.1 * radius
     roots = np.cos(np.pi * (np.arange(degree) + 0.5) / degree)

@@ -17,8 +17,8 @@ from .padded import Layout, adjoint
 from .precondition import AbstractPreconditioner
 
 
-class _Square(lx.AbstractLinearOperator):
-    """A linear map of fields `(n,)` for lineax, of which nothing but products is known."""
+class Square(lx.AbstractLinearOperator):
+    """A linear map of fields for lineax, of which nothing but products is known."""
 
     def out_structure(self):
         return self.in_structure()
@@ -27,7 +27,26 @@ class _Square(lx.AbstractLinearOperator):
         raise NotImplementedError("an n x n array is what these operators avoid")
 
 
-class System(_Square):
+def matrix_free(kind):
+    """Tell lineax that a class of `Square` operators has no properties to make use of."""
+    lx.linearise.register(kind, lambda operator: operator)
+    lx.conj.register(kind, lambda operator: operator)
+    for has_property in (
+        lx.is_symmetric,
+        lx.is_diagonal,
+        lx.is_tridiagonal,
+        lx.is_lower_triangular,
+        lx.is_upper_triangular,
+        lx.is_positive_semidefinite,
+        lx.is_negative_semidefinite,
+        lx.has_unit_diagonal,
+    ):
+        has_property.register(kind, lambda operator: False)
+    return kind
+
+
+@matrix_free
+class System(Square):
     r"""$P A E + (1 - P) - \sigma\, p\, p^T / p^T p$ with $p = P 1$.
 
     Nonsingular where the problem has one solution (for an operator that annihilates the
@@ -91,7 +110,8 @@ class System(_Square):
         return jax.ShapeDtypeStruct((self.operator.n,), self.dtype)
 
 
-class Transposed(_Square):
+@matrix_free
+class Transposed(Square):
     """The transpose of a system, the weights of its operator gathered once."""
 
     system: System
@@ -115,7 +135,8 @@ class Transposed(_Square):
         return self.system.in_structure()
 
 
-class Inverse(_Square):
+@matrix_free
+class Inverse(Square):
     """A preconditioner for a system: exact on the constants of a mean-zero problem."""
 
     preconditioner: AbstractPreconditioner
@@ -140,19 +161,3 @@ def _turned(conditions, v):
     """Eᵀ v: what a bound value came from gets its share; only free points are left."""
     shares = conditions.weights * v[conditions.rows]
     return conditions.restrict(v.at[conditions.indices].add(shares))
-
-
-for _kind in (System, Transposed, Inverse):
-    lx.linearise.register(_kind, lambda operator: operator)
-    lx.conj.register(_kind, lambda operator: operator)
-    for _property in (
-        lx.is_symmetric,
-        lx.is_diagonal,
-        lx.is_tridiagonal,
-        lx.is_lower_triangular,
-        lx.is_upper_triangular,
-        lx.is_positive_semidefinite,
-        lx.is_negative_semidefinite,
-        lx.has_unit_diagonal,
-    ):
-        _property.register(_kind, lambda operator: False)

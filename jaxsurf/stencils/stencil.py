@@ -135,7 +135,7 @@ class Stencil(AbstractOperator):
         columns = np.broadcast_to(columns, weights.shape)
         # Rows stay in the order of the slots: to sort them takes longer than all the rest.
         pointers = np.arange(n * p + 1) * (self.k * q)
-        data = (weights.ravel(), columns.ravel(), pointers)
+        data = (weights.flatten(), columns.flatten(), pointers)  # copies, to be changed in place
         matrix = scipy.sparse.csr_matrix(data, shape=(n * p, n * q))
         matrix.eliminate_zeros()
         return matrix

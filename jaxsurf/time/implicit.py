@@ -315,7 +315,9 @@ def _steps(tableau: Tableau, terms, solve, t0, t1, y0, args, rates):
     y1 = _combined(y0, jnp.asarray(tableau.weights, real), total)
     zero = jax.tree.map(jnp.zeros_like, y0)
     error = _combined(zero, jnp.asarray(tableau.errors, real), total)
+    # Nothing of a step whose equations were not solved is to be kept.
     error = jax.tree.map(lambda e: jnp.where(ok == fine, e, jnp.inf), error)
+    y1 = jax.tree.map(lambda y: jnp.where(ok == fine, y, jnp.nan), y1)
     rates = tuple(term.vf(t1, y1, args) for term in terms)
     k1 = _sum([term.prod(rate, s) for term, rate, s in zip(terms, rates, span)])
     return y1, error, dict(y0=y0, y1=y1, k0=_sum(first), k1=k1), rates, ok
@@ -343,10 +345,10 @@ class _Relative(lx.AbstractLinearSolver):
         x, result, stats = self.solver.compute(inner, unit, options)
         residual = jax.tree.map(jnp.subtract, operator.mv(x), unit)
         good = _norm(residual) <= 10 * self.tolerance
+        # Too many steps of this solver are not to be mistaken for too many steps in time.
+        mild = (result == lx.RESULTS.successful) | (result == lx.RESULTS.max_steps_reached)
         result = lx.RESULTS.where(
-            good,
-            lx.RESULTS.successful,
-            lx.RESULTS.where(result == lx.RESULTS.successful, lx.RESULTS.stagnation, result),
+            good, lx.RESULTS.successful, lx.RESULTS.where(mild, lx.RESULTS.stagnation, result)
         )
         return jax.tree.map(lambda x: scale * x, x), result, stats
 

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, PyTree
 
+from ..cloud import as_float
+from .checkpoint import Checkpoint, integrate_in_parts
 from .pde import AbstractEvolution
 from .run import Run
 
@@ -48,6 +50,7 @@ def integrate(
     saveat: dfx.SaveAt | None = None,
     event: dfx.Event | None = None,
     progress: bool = False,
+    checkpoint: Checkpoint | None = None,
     adjoint: dfx.AbstractAdjoint | None = None,
     args: Any = None,
     max_steps: int | None = None,
@@ -70,10 +73,12 @@ def integrate(
             filled in.
         event: ends the integration early, a `diffrax.Event`; see `steady_state`.
         progress: show a progress bar.
+        checkpoint: write the state to disk now and then, and go on from there if it is.
         adjoint: how to differentiate; by default reverse mode with 64 copies of the state
             however many the steps. `diffrax.ForwardMode()` for forward mode.
         args: handed to reactions and forcings.
-        max_steps: by default ten million, or 4,096 where every step is stored.
+        max_steps: by default ten million, or 4,096 where every step is stored; with a
+            checkpoint, of one part.
         throw: raise if the end is not reached; if False, see `Solution.result`.
 
     Returns:
@@ -84,7 +89,8 @@ def integrate(
     Differentiable: reverse (forward with `ForwardMode`) in the state, the problem and `args`, for
     the steps taken: how the controller chose them is not differentiated.
     Raises:
-        ValueError: a state that is not finite, or for which the right-hand side is not.
+        ValueError: a state that is not finite, or for which the right-hand side is not; a
+            checkpoint that is of another run or damaged.
         IntegrationError: the end was not reached: the solution diverges, the tolerance cannot
             be met, a linear system does not converge. Holds the last good state. (Under
             `jit` an error of the run time.)
@@ -98,6 +104,20 @@ def integrate(
         >>> bool(jnp.abs(solution.ys[-1] - jnp.exp(-1.0) * cloud.points[:, 2]).max() < 0.01)
         True
     """
+    if checkpoint is not None:
+
+        def part(state, start, end, saves):
+            return integrate(
+                problem, state, t1=end, t0=start, solver=solver, dt0=dt0, rtol=rtol, atol=atol,
+                controller=controller, saveat=saves, event=event, adjoint=adjoint, args=args,
+                max_steps=max_steps, throw=throw,
+            )  # fmt: skip
+
+        settings = (problem, solver, dt0, rtol, atol, controller, event)
+        return integrate_in_parts(
+            checkpoint, part, jax.tree.map(as_float, u0), t0, t1,
+            dfx.SaveAt(t1=True) if saveat is None else saveat, args, settings, progress,
+        )  # fmt: skip
     run = Run.of(problem, u0, t0, t1, solver, dt0, rtol, atol, controller, adjoint, args)
     saveat = dfx.SaveAt(t1=True) if saveat is None else saveat
     if max_steps is None:
@@ -213,7 +233,7 @@ def _reason(run: Run, solution: dfx.Solution, t: float, state) -> str:
         ),
         (
             dfx.RESULTS.nonlinear_divergence,
-            "a step diverged, needed more stages than allowed, or its equations have no solution",
+            "a step diverged, needed more stages than allowed, or a system in it was not solved",
         ),
     )
     reason = next((text for code, text in why if solution.result == code), None)

@@ -1,0 +1,141 @@
+r"""Multigrid for $1 - g A$ with any g, as implicit steps of changing length need it."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+from jaxtyping import Array, ArrayLike, Float
+
+from ..boundary import Closure
+from ..cloud import is_concrete
+from ..stencils.stencil import AbstractOperator, check_scalar
+from .padded import PaddedMatrix
+from .precondition import (
+    Level,
+    Multigrid,
+    aggregate,
+    chebyshev,
+    divisor,
+    jacobi_radius,
+    smoothed,
+)
+
+# The coarsest system has at most this many unknowns; its inverse is computed for every g.
+_COARSEST = 100
+
+
+class _Pair(eqx.Module):
+    """A level of the identity M and of A, with one layout.
+
+    Args:
+        mass, stiff: M and A.
+        mass_turned, stiff_turned: their transposes.
+        mass_diagonal, stiff_diagonal: what to divide by; safe for rows of both signs.
+        restrict, prolong: to and from the next coarser level.
+        radius: of either after division by its diagonal, the larger.
+    """
+
+    mass: PaddedMatrix
+    stiff: PaddedMatrix
+    mass_turned: PaddedMatrix
+    stiff_turned: PaddedMatrix
+    mass_diagonal: Float[Array, " m"]
+    stiff_diagonal: Float[Array, " m"]
+    restrict: PaddedMatrix
+    prolong: PaddedMatrix
+    radius: float = eqx.field(static=True)
+
+    def at(self, g) -> Level:
+        inverse = 1 / (self.mass_diagonal - g * self.stiff_diagonal)
+        return Level(
+            self.mass.minus(g, self.stiff),
+            self.mass_turned.minus(g, self.stiff_turned),
+            inverse,
+            self.restrict,
+            self.prolong,
+            chebyshev(self.radius, inverse.dtype),
+        )
+
+
+class ShiftedMultigrid(eqx.Module):
+    """Multigrid hierarchies for all $1 - g A$, g ≥ 0: made by `shifted_multigrid`.
+
+    Args:
+        pairs: levels, from fine to coarse.
+        mass, stiff: the coarsest level, dense.
+    """
+
+    pairs: tuple[_Pair, ...]
+    mass: Float[Array, "m m"]
+    stiff: Float[Array, "m m"]
+
+    def at(self, g: ArrayLike) -> Multigrid:
+        """The V-cycle for one g, which may be traced."""
+        g = jnp.asarray(g).astype(self.mass.dtype)
+        levels = tuple(pair.at(g) for pair in self.pairs)
+        return Multigrid(None, False, levels, jnp.linalg.inv(self.mass - g * self.stiff))
+
+
+def shifted_multigrid(
+    operator: AbstractOperator, *, conditions: Closure | None = None
+) -> ShiftedMultigrid:
+    r"""Set up smoothed aggregation for $1 - g A$ once, for all g ≥ 0.
+
+    The aggregates and the prolongation are those of A. On every level M, the identity restricted,
+    and A restricted are kept apart, so that $M - g A$ is a sum of two arrays.
+
+    Args:
+        operator: A, scalar, with concrete arrays and eigenvalues of real part ≤ 0.
+        conditions: from `js.close` or `js.with_ghosts`.
+
+    Returns:
+        Whose `at(g)` is a preconditioner.
+
+    Raises:
+        ImportError: pyamg is not installed (extra `multigrid`).
+        ValueError: an operator that is traced or has components.
+    """
+    check_scalar(operator)
+    if not is_concrete(*jax.tree.leaves((operator, conditions))):
+        raise ValueError(
+            "multigrid is set up on concrete arrays: call this outside jit and "
+            "grad, and pass its result to the solver"
+        )
+    stiff = operator.to_scipy()
+    if conditions is not None:
+        free = scipy.sparse.diags((~np.asarray(conditions.bound)).astype(stiff.dtype))
+        stiff = (free @ stiff @ conditions.to_scipy()).tocsr()
+    mass = scipy.sparse.identity(stiff.shape[0], stiff.dtype, format="csr")
+    constant = np.ones(stiff.shape[0])
+    pairs = []
+    while stiff.shape[0] > _COARSEST:
+        found = aggregate(stiff, constant)
+        if found is None:
+            break
+        tentative, constant = found
+        pair, mass, stiff = _pair(mass, stiff, tentative)
+        pairs.append(pair)
+    dense = lambda a: jnp.asarray(a.toarray().astype(np.float32))
+    return ShiftedMultigrid(tuple(pairs), dense(mass), dense(stiff))
+
+
+def _pair(mass, stiff, tentative):
+    """A level, and M and A on the next one."""
+    below, beside = divisor(stiff), divisor(mass)
+    inverse = np.divide(1, below, out=np.zeros_like(below), where=below != 0)
+    radius = jacobi_radius(stiff, inverse)
+    prolong = smoothed(stiff, tentative, inverse, radius)
+    restrict = prolong.T.tocsr()
+    # In one complex matrix both get one layout.
+    both = (mass + 1j * stiff).tocsr()
+    pad = lambda a: PaddedMatrix.from_scipy(a.tocsr(), np.dtype(np.float32))
+    parts = [pad(part) for a in (both, both.T.tocsr()) for part in (a.real, a.imag)]
+    vector = lambda a: jnp.asarray(a.astype(np.float32))
+    pair = _Pair(
+        *parts, vector(beside), vector(below), pad(restrict), pad(prolong),
+        max(radius, jacobi_radius(mass, 1 / beside)),
+    )  # fmt: skip
+    return pair, (restrict @ (mass @ prolong)).tocsr(), (restrict @ (stiff @ prolong)).tocsr()

@@ -105,6 +105,7 @@ def mirrored(cloud, conditions, method):
 # --- the closure ---------------------------------------------------------------------------
 
 
+@pytest.mark.core
 def test_bound_values_of_polynomials_are_exact():
     cloud = square(11)
     x, y = cloud.points[:, 0], cloud.points[:, 1]
@@ -117,6 +118,7 @@ def test_bound_values_of_polynomials_are_exact():
             np.testing.assert_allclose(closure(wrong), u, atol=1e-10)
 
 
+@pytest.mark.core
 def test_the_parts_of_a_closure_agree():
     cloud = square(9)
     x = np.asarray(cloud.points)
@@ -152,6 +154,7 @@ def test_the_parts_of_a_closure_agree():
     assert not closure.restrict(u)[closure.bound].any()
 
 
+@pytest.mark.core
 def test_values_per_component():
     cloud = square(7)
     value = jnp.array([[1.0, 2.0]])
@@ -263,6 +266,7 @@ def test_even_and_odd_images_of_symmetric_fields():
     np.testing.assert_allclose(closure.extend(exact(cloud.points)), exact(wide.points), atol=1e-11)
 
 
+@pytest.mark.core
 def test_images_of_a_sphere_lie_on_it():
     cloud = cap(600)
     wide, _ = js.with_ghosts(cloud, js.neumann(cloud.boundary), depth=0.3)

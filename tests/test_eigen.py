@@ -27,6 +27,7 @@ def sphere_modes():
     return cloud, js.eigenmodes(laplacian(cloud), 25)
 
 
+@pytest.mark.core
 def test_groups_of_the_sphere(sphere_modes):
     _, modes = sphere_modes
     np.testing.assert_allclose(modes.values, _SPHERE, rtol=2e-4, atol=1e-10)
@@ -36,6 +37,7 @@ def test_groups_of_the_sphere(sphere_modes):
     assert modes.residuals.max() < 1e-8
 
 
+@pytest.mark.core
 def test_functions_of_the_sphere(sphere_modes):
     cloud, modes = sphere_modes
     np.testing.assert_allclose(modes.functions[:, 0], 1, atol=1e-10)
@@ -86,6 +88,7 @@ def test_dirichlet_conditions():
     assert jnp.linalg.norm(first - z) < 1e-2 * jnp.linalg.norm(z)
 
 
+@pytest.mark.core
 def test_conjugate_pairs():
     r"""On a circle $u'' + c u'$ has the eigenvalues $-m^2 \pm i c m$."""
     n, c = 64, 0.05
@@ -176,6 +179,7 @@ def test_derivative_of_the_projection_on_a_group(jittered):
     check(part, cloud.points)
 
 
+@pytest.mark.core
 def test_exactly_equal_values():
     """Fibonacci points and order 4 split the values by 1e-5; here they are not split at all."""
     n = 48

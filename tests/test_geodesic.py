@@ -65,6 +65,7 @@ def test_a_region_as_source():
     assert relative_error(distance, exact) < 2e-2
 
 
+@pytest.mark.core
 def test_scale_and_far_points():
     """Over 250 spacings heat falls by more than 200 powers of ten."""
     angle = 2 * jnp.pi * jnp.arange(1_000) / 1_000
@@ -95,6 +96,7 @@ def test_gradient_in_points_and_normals():
     check_derivative(observed, jnp.stack([cloud.points, cloud.normals]), step=1e-4)
 
 
+@pytest.mark.core
 def test_misuse():
     cloud = js.sphere(300)
     with pytest.raises(ValueError, match="no sources"):

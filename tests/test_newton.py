@@ -22,6 +22,7 @@ def problem():
     return cloud, operator, js.multigrid(operator.shifted(1.0))
 
 
+@pytest.mark.core
 def test_known_solution_in_few_steps(problem):
     cloud, operator, _ = problem
     z = cloud.points[:, 2]

@@ -40,6 +40,7 @@ def test_padded_matrix_with_uneven_rows():
     np.testing.assert_allclose(matrix(jnp.asarray(x)), dense @ x, atol=1e-13)
 
 
+@pytest.mark.core
 def test_adjoint_by_gathers_is_the_transpose(screened):
     u, v = _fields(screened.n)
     turned = adjoint(screened, incoming_layout(screened))
@@ -52,6 +53,7 @@ def test_adjoint_by_gathers_is_the_transpose(screened):
     assert jaxpr.count("= scatter") <= 1
 
 
+@pytest.mark.core
 def test_cycle_is_linear_and_its_transpose_exact(screened):
     u, v = _fields(screened.n)
     cycle = js.multigrid(screened, single=False)
@@ -65,6 +67,7 @@ def test_cycle_is_linear_and_its_transpose_exact(screened):
     np.testing.assert_allclose(single(1e-60 * u) * 1e60, single(u), rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.core
 def test_one_cycle_damps_every_error():
     # Spectral radius of I - M A, by the power method.
     screened = js.laplace_beltrami(js.sphere(3_000)).scaled(-1.0).shifted(1.0)

@@ -66,6 +66,7 @@ def test_biharmonic(sphere):
     assert relative_error(found.value, z) < 5e-3
 
 
+@pytest.mark.core
 def test_mean_zero_sense(sphere):
     cloud, laplacian, preconditioner = sphere
     z = cloud.points[:, 2]
@@ -83,6 +84,7 @@ def test_mean_zero_sense(sphere):
     assert abs(float(other.stats["incompatible"]) + 3) < 1e-6
 
 
+@pytest.mark.core
 def test_conditions_are_met_and_equations_hold_elsewhere(sphere):
     cloud, laplacian, _ = sphere
     z = cloud.points[:, 2]
@@ -127,6 +129,7 @@ def test_no_retracing_for_other_values(sphere):
     assert traces == 1
 
 
+@pytest.mark.core
 def test_derivatives_in_weights_and_right_hand_side(sphere):
     cloud, laplacian, preconditioner = sphere
     z = cloud.points[:, 2]
@@ -249,6 +252,7 @@ def test_a_solver_of_lineax(sphere):
         js.solve(laplacian, -2 * z, preconditioner=preconditioner, solver=loose)
 
 
+@pytest.mark.core
 def test_failures_speak(sphere):
     cloud, laplacian, preconditioner = sphere
     z = cloud.points[:, 2]
@@ -282,6 +286,7 @@ def test_a_singular_system_is_an_error(sphere):
         js.solve(singular, f, preconditioner=js.jacobi(laplacian), max_steps=200)
 
 
+@pytest.mark.core
 def test_bad_input(sphere):
     cloud, laplacian, preconditioner = sphere
     z = cloud.points[:, 2]

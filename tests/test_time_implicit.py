@@ -39,6 +39,7 @@ def trees(order):
         yield lambda b, c, A: b @ A @ c**2, 1 / 12
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("order, tableau", [*_IMEX.items(), *_SDIRK.items()])
 def test_tableaus_satisfy_the_order_conditions(order, tableau):
     """Also mixed ones (explicit and implicit matrices), and one order lower when embedded."""
@@ -169,6 +170,7 @@ def test_derivatives(solver):
     assert largest_array(program.jaxpr) < CLOUD.n**2 / 2
 
 
+@pytest.mark.core
 def test_linear_systems_that_are_not_solved_are_reported():
     u0 = jnp.exp(CLOUD.points[:, 2])
     weak = js.IMEX(order=3, solver=lx.BiCGStab(rtol=0.0, atol=1e-10, max_steps=2), tolerance=1e-10)
@@ -190,6 +192,7 @@ def test_newton_that_fails_shortens_the_step():
         js.integrate(one, u0, t1=10.0, dt0=10.0, solver=solver)
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("kind", [js.IMEX, js.SDIRK])
 def test_unknown_order(kind):
     with pytest.raises(ValueError, match="order = 7, there are"):

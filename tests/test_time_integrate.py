@@ -20,6 +20,7 @@ Z = CLOUD.points[:, 2]
 HEAT = js.AdvectionDiffusionReaction(LAPLACIAN)
 
 
+@pytest.mark.core
 def test_the_choice_is_told(caplog):
     with caplog.at_level(logging.INFO, logger="jaxsurf"):
         solution = js.integrate(HEAT, Z, t1=0.1)
@@ -104,6 +105,7 @@ def test_the_gradient_is_the_same_with_few_copies_of_the_state():
 # --- failures ------------------------------------------------------------------------------
 
 
+@pytest.mark.core
 def test_explosion_keeps_the_last_good_state():
     """u' = u² from 1 explodes at t = 1."""
     problem = js.AdvectionDiffusionReaction(LAPLACIAN, reaction=lambda t, u, args: u**2)
@@ -140,6 +142,7 @@ def test_failure_under_jit_is_an_error_of_the_run_time():
         jax.block_until_ready(run(Z))
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(
     "arguments, message",
     [
@@ -174,6 +177,7 @@ class Stop(Exception):
     pass
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_run_that_was_killed_goes_on_bit_by_bit(kind, tmp_path, monkeypatch):
     u0 = jnp.exp(CLOUD.points[:, 0])
@@ -228,6 +232,7 @@ def test_a_checkpointed_run_that_ends_early(tmp_path):
     np.testing.assert_allclose(solution.ys[2], 1.0, atol=1e-3)
 
 
+@pytest.mark.core
 def test_files_of_other_runs_are_refused(tmp_path):
     file = js.Checkpoint(tmp_path / "run.npz", every=0.05)
     js.integrate(HEAT, Z, t1=0.1, checkpoint=file)

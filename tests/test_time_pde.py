@@ -23,6 +23,7 @@ X, Y, Z = CLOUD.points.T
 TURN = jnp.cross(jnp.array([0.0, 0.0, 1.0]), CLOUD.points)  # one radian per unit of time
 
 
+@pytest.mark.core
 def test_two_species_with_their_own_diffusivities_and_a_reaction():
     """z decays with 2 D, xy with 6 D; the reaction turns the two species into each other."""
     u0 = jnp.stack([Z + X * Y, 0 * Z], axis=1)
@@ -68,6 +69,7 @@ def test_rotation_carries_the_field_along(conservative):
         np.testing.assert_allclose(pair.ys[-1], jnp.stack([u, 2 * u], axis=1), rtol=1e-4)
 
 
+@pytest.mark.core
 def test_compressible_flow():
     """v = grad z: the two forms differ by u times the divergence, -2 z."""
     v = jnp.array([0.0, 0.0, 1.0]) - Z[:, None] * CLOUD.points
@@ -119,6 +121,7 @@ def test_hyperviscosity_is_of_high_order():
     assert np.log2(errors[0] / errors[1]) > 2.7  # h halves, h³
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("damping", [0.0, 0.5])
 def test_standing_wave(damping):
     """u = e^(-γt/2) cos(ω t) z, ω² = 2 c² - γ²/4, the forcing constant."""
@@ -136,6 +139,7 @@ def test_standing_wave(damping):
         np.testing.assert_allclose(lifted - solution.ys[0][-1], 2.0, atol=1e-5)
 
 
+@pytest.mark.core
 def test_biharmonic_decay():
     problem = js.BiharmonicDiffusion(LAPLACIAN, stiffness=0.1)
     u = js.integrate(problem, X * Y, t1=0.2, rtol=1e-6, atol=1e-8).ys[-1]
@@ -225,6 +229,7 @@ def test_rates_are_differentiable_in_every_array():
     np.testing.assert_allclose(float(sum(products)), expected, rtol=1e-8)
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(
     "arguments, message",
     [

@@ -29,9 +29,13 @@ def error(cloud, method):
     "method, bounds, slopes",
     [
         (js.DCPSE(order=2), (3.5e-3, 5.5e-3, 6.5e-3), (1.8, 1.8, 1.8)),
-        (js.DCPSE(order=3), (1e-4, 6e-5, 8e-5), (2.8, 2.8, 2.8)),
+        pytest.param(
+            js.DCPSE(order=3), (1e-4, 6e-5, 8e-5), (2.8, 2.8, 2.8), marks=pytest.mark.slow
+        ),
         (js.DCPSE(order=4), (1.1e-5, 2.1e-5, 2.9e-5), (3.8, 3.8, 3.8)),
-        (js.GFDM(degree=3), (2.5e-3, 2e-5, 5e-5), (1.8, 2.8, 2.8)),
+        pytest.param(
+            js.GFDM(degree=3), (2.5e-3, 2e-5, 5e-5), (1.8, 2.8, 2.8), marks=pytest.mark.slow
+        ),
         (js.GFDM(degree=4), (2e-5, 8e-6, 3e-5), (2.8, 3.8, 3.8)),
     ],
     ids=["DCPSE2", "DCPSE3", "DCPSE4", "GFDM3", "GFDM4"],

@@ -62,6 +62,7 @@ def test_demo(tmp_path, capsys):
     check_files(tmp_path, 3_000)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not _DATA.is_dir(), reason="no folder ../shared/data with the scans")
 def test_demo_on_a_scan(tmp_path, capsys):
     # No normals in the file, unused vertices, holes, ears thinner than a stencil.

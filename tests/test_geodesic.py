@@ -65,7 +65,6 @@ def test_a_region_as_source():
     assert relative_error(distance, exact) < 2e-2
 
 
-@pytest.mark.core
 def test_scale_and_far_points():
     """Over 250 spacings heat falls by more than 200 powers of ten."""
     angle = 2 * jnp.pi * jnp.arange(1_000) / 1_000

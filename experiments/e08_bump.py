@@ -2,8 +2,8 @@ r"""Diffusion over a bump, compared with fine finite elements (paper 001, Sectio
 
 Two sets of points. The paper's: a regular grid with h = 1/32 = 0.03125 outside the bump and a
 golden-angle spiral of equal areas on it, 18,439 in all; as many as the paper has, which leaves
-1,995 for the bump. And graded ones, 10,368 to 18,683 of them: a spiral around the bump, fine as far as
-the initial field reaches, coarser towards the border.
+1,995 for the bump. And graded ones, 10,368 to 18,683 of them: a spiral around the bump, fine as far
+as the initial field reaches, coarser towards the border.
 
 Peaks are largest values over time at the probes. The width of the paper's kernel is not
 given: here h. What the paper reports are distances to surface FEM; ours are to the

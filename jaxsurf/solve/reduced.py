@@ -13,17 +13,17 @@ from ..cloud import is_concrete
 _ROUNDOFF = 32
 
 
-def reduced_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
-    """P A E with the identity at bound points, as a CSR matrix.
+def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
+    """P A E as a CSR matrix, zero in the rows of bound points.
 
     Raises:
-        ValueError: traced or non-finite weights, or a zero row.
+        ValueError: traced or non-finite weights.
     """
     leaves = jax.tree.leaves((operator, conditions))
     if not is_concrete(*leaves):
         raise ValueError(
-            "multigrid is set up on concrete arrays: call js.multigrid outside jit and grad, "
-            "and pass its result as `preconditioner`"
+            "multigrid is set up on concrete arrays: call js.multigrid or js.step_preconditioner "
+            "outside jit and grad, and pass its result as `preconditioner`"
         )
     matrix = operator.to_scipy()
     if not np.isfinite(matrix.data).all():
@@ -32,13 +32,22 @@ def reduced_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
     if conditions is not None:
         if conditions.n != operator.n:
             raise ValueError(f"conditions for {conditions.n} points, the operator has {operator.n}")
-        bound = np.asarray(conditions.bound)
-        free = scipy.sparse.diags((~bound).astype(matrix.dtype))
-        matrix = free @ matrix @ conditions.to_scipy() + scipy.sparse.diags(
-            bound.astype(matrix.dtype)
-        )
-        matrix = matrix.tocsr()
+        free = scipy.sparse.diags((~np.asarray(conditions.bound)).astype(matrix.dtype))
+        matrix = (free @ matrix @ conditions.to_scipy()).tocsr()
         matrix.eliminate_zeros()
+    return matrix
+
+
+def reduced_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
+    """P A E with the identity at bound points, as a CSR matrix.
+
+    Raises:
+        ValueError: traced or non-finite weights, or a zero row.
+    """
+    matrix = free_matrix(operator, conditions)
+    if conditions is not None:
+        bound = np.asarray(conditions.bound).astype(matrix.dtype)
+        matrix = (matrix + scipy.sparse.diags(bound)).tocsr()
     empty = np.flatnonzero(np.diff(matrix.indptr) == 0)
     if empty.size:
         raise ValueError(

@@ -3,14 +3,12 @@ r"""Multigrid for $1 - g A$ with any g, as implicit steps of changing length nee
 from __future__ import annotations
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 from jaxtyping import Array, ArrayLike, Float
 
 from ..boundary import Closure
-from ..cloud import is_concrete
 from ..stencils.stencil import AbstractOperator, check_scalar
 from .padded import PaddedMatrix
 from .precondition import (
@@ -22,6 +20,7 @@ from .precondition import (
     jacobi_radius,
     smoothed,
 )
+from .reduced import free_matrix
 
 # The coarsest system has at most this many unknowns; its inverse is computed for every g.
 _COARSEST = 100
@@ -96,18 +95,10 @@ def shifted_multigrid(
 
     Raises:
         ImportError: pyamg is not installed (extra `multigrid`).
-        ValueError: an operator that is traced or has components.
+        ValueError: an operator that is traced, not finite, or has components.
     """
     check_scalar(operator)
-    if not is_concrete(*jax.tree.leaves((operator, conditions))):
-        raise ValueError(
-            "multigrid is set up on concrete arrays: call this outside jit and "
-            "grad, and pass its result to the solver"
-        )
-    stiff = operator.to_scipy()
-    if conditions is not None:
-        free = scipy.sparse.diags((~np.asarray(conditions.bound)).astype(stiff.dtype))
-        stiff = (free @ stiff @ conditions.to_scipy()).tocsr()
+    stiff = free_matrix(operator, conditions)
     mass = scipy.sparse.identity(stiff.shape[0], stiff.dtype, format="csr")
     constant = np.ones(stiff.shape[0])
     pairs = []

@@ -95,10 +95,9 @@ def integrate_in_parts(
     # A remainder that is nothing but round-off is no part of its own.
     count = max(1, int(np.ceil((t1 - t0) / checkpoint.every * (1 - 1e-12))))
     ends = np.append(t0 + checkpoint.every * np.arange(count), t1)
-    times = np.concatenate([np.zeros(0) if sub.ts is None else np.asarray(sub.ts), [t0, t1]])
-    asked = [sub.t0] + [True] * (len(times) - 2) + [sub.t1]
-    order = np.concatenate([[len(times) - 2], np.arange(len(times) - 2), [len(times) - 1]])
-    times = times[order]
+    between = np.zeros(0) if sub.ts is None else np.asarray(sub.ts)
+    times = np.concatenate([[t0], between, [t1]])
+    asked = np.array([sub.t0, *[True] * len(between), sub.t1])
 
     path = Path(checkpoint.path)
     key = _digest((checkpoint.every, u0, t0, t1, sub.ts, args, settings))
@@ -131,7 +130,7 @@ def integrate_in_parts(
                 break
             _write(path, key, now)
             bar.update()
-    return _joined(solution, now, times, np.array(asked), reached, last, sub, args)
+    return _joined(solution, now, times, asked, reached, last, sub, args)
 
 
 def _single(saveat: dfx.SaveAt) -> dfx.SubSaveAt:

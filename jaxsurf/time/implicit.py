@@ -34,6 +34,11 @@ class Tableau(eqx.Module):
     weights: np.ndarray
     errors: np.ndarray
 
+    @property
+    def gamma(self) -> float:
+        """The share of a step that every implicit stage solves for."""
+        return float(self.diagonal[1])
+
     @classmethod
     def of(cls, explicit: dfx.ButcherTableau, implicit: dfx.ButcherTableau) -> Tableau:
         return cls(
@@ -147,22 +152,22 @@ class IMEX(dfx.AbstractAdaptiveSolver):
         span = implicit.contr(t0, t1)
         solver = _relative(self.solver, self.tolerance, y0)
 
-        def solve(t, known, start, factor):
+        tableau = _IMEX[self.scheme]
+        options = _options(self.preconditioner, tableau.gamma * (t1 - t0))
+
+        def solve(t, known, start):
             def left_side(y):
                 change = implicit.vf_prod(t, y, args, span)
-                return jax.tree.map(lambda y, k: y - factor * k, y, change)
+                return jax.tree.map(lambda y, k: y - tableau.gamma * k, y, change)
 
             operator = lx.FunctionLinearOperator(left_side, jax.eval_shape(lambda: y0))
-            options = {}
-            if self.preconditioner is not None:
-                options["preconditioner"] = self.preconditioner(factor * (t1 - t0))
             rest = jax.tree.map(jnp.subtract, known, operator.mv(start))
             found = lx.linear_solve(operator, rest, solver, options=options, throw=False)
             y = jax.tree.map(jnp.add, start, found.value)
             return y, dfx.RESULTS.promote(found.result)
 
         rates = tuple(terms.terms)
-        return _steps(_IMEX[self.scheme], rates, solve, t0, t1, y0, args, solver_state)
+        return _steps(tableau, rates, solve, t0, t1, y0, args, solver_state)
 
 
 class SDIRK(dfx.AbstractAdaptiveSolver):
@@ -225,14 +230,14 @@ class SDIRK(dfx.AbstractAdaptiveSolver):
         span = terms.contr(t0, t1)
         tolerance = _tolerance(self.tolerance, y0)
 
-        def solve(t, known, start, factor):
+        tableau = _SDIRK[self.scheme]
+        options = _options(self.preconditioner, tableau.gamma * (t1 - t0))
+
+        def solve(t, known, start):
             def residual(y):
                 change = terms.vf_prod(t, y, args, span)
-                return jax.tree.map(lambda y, k, r: y - factor * k - r, y, change, known)
+                return jax.tree.map(lambda y, k, r: y - tableau.gamma * k - r, y, change, known)
 
-            options = {}
-            if self.preconditioner is not None:
-                options["preconditioner"] = self.preconditioner(factor * (t1 - t0))
             inner = _relative(self.solver, _FORCING, y0)
             outer = _relative(self.solver, self.tolerance, y0)
             structure = jax.eval_shape(lambda: y0)
@@ -264,7 +269,12 @@ class SDIRK(dfx.AbstractAdaptiveSolver):
                 converged > 0, dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence
             )
 
-        return _steps(_SDIRK[self.scheme], (terms,), solve, t0, t1, y0, args, solver_state)
+        return _steps(tableau, (terms,), solve, t0, t1, y0, args, solver_state)
+
+
+def _options(preconditioner: Preconditioner | None, shift) -> dict:
+    """For the linear solves of all stages of a step, whose matrices are the same but for f'."""
+    return {} if preconditioner is None else {"preconditioner": preconditioner(shift)}
 
 
 # Residual of a Newton step's linear system over its right-hand side.
@@ -278,12 +288,11 @@ def _steps(tableau: Tableau, terms, solve, t0, t1, y0, args, rates):
     fast.
 
     Args:
-        solve: (t, r, start, γ) -> y with y - γ Δt f(t, y) = r, and its result code.
+        solve: (t, r, start) -> y with y - γ Δt f(t, y) = r, and its result code.
         rates: the terms at the start of the step, from the step before.
     """
     span = [term.contr(t0, t1) for term in terms]
     matrices = (tableau.explicit, tableau.implicit)[-len(terms) :]
-    gamma = float(tableau.diagonal[1])
     first = [term.prod(rate, s) for term, rate, s in zip(terms, rates, span)]
     count = len(tableau.nodes)
     # Increments, term by term and stage by stage.
@@ -296,7 +305,7 @@ def _steps(tableau: Tableau, terms, solve, t0, t1, y0, args, rates):
         for w, increments in zip(weights, room):
             known = _combined(known, w, increments)
         t = t0 + node * (t1 - t0)
-        y, result = solve(t, known, y, gamma)
+        y, result = solve(t, known, y)
         ok = dfx.RESULTS.where(ok == dfx.RESULTS.successful, result, ok)
         new = [term.vf_prod(t, y, args, s) for term, s in zip(terms, span)]
         room = jax.tree.map(lambda r, k: r.at[i].set(k), room, new)

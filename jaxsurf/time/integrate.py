@@ -104,6 +104,7 @@ def integrate(
         >>> bool(jnp.abs(solution.ys[-1] - jnp.exp(-1.0) * cloud.points[:, 2]).max() < 0.01)
         True
     """
+    saveat = dfx.SaveAt(t1=True) if saveat is None else saveat
     if checkpoint is not None:
 
         def part(state, start, end, saves):
@@ -115,11 +116,10 @@ def integrate(
 
         settings = (problem, solver, dt0, rtol, atol, controller, event)
         return integrate_in_parts(
-            checkpoint, part, jax.tree.map(as_float, u0), t0, t1,
-            dfx.SaveAt(t1=True) if saveat is None else saveat, args, settings, progress,
+            checkpoint, part, jax.tree.map(as_float, u0), t0, t1, saveat, args, settings,
+            progress,
         )  # fmt: skip
     run = Run.of(problem, u0, t0, t1, solver, dt0, rtol, atol, controller, adjoint, args)
-    saveat = dfx.SaveAt(t1=True) if saveat is None else saveat
     if max_steps is None:
         max_steps = _STORED_STEPS if _stores_steps(saveat) else _MANY_STEPS
     solution = dfx.diffeqsolve(

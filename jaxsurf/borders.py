@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .cloud import PointCloud, is_concrete
+from .arguments import is_concrete
+from .cloud import PointCloud
 from .frames import tangent_frames
 from .neighbors import nearest
 from .shapes.meshes import TriangleMesh

@@ -21,9 +21,10 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
+from .arguments import is_concrete
 from .borders import Border, find_border
 from .build import residual_tolerance, stencil_weights
-from .cloud import PointCloud, is_concrete
+from .cloud import PointCloud
 from .conditions import Condition, checked_conditions
 from .neighbors import Neighbors, nearest_of
 from .stencils.gfdm import GFDM

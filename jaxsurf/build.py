@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .cloud import PointCloud, is_concrete
+from .arguments import is_concrete
+from .cloud import PointCloud
 from .neighbors import Neighbors, find_neighbors, nearest_of
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood

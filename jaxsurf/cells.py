@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .cloud import is_concrete
+from .arguments import is_concrete
 from .neighbors import Neighbors, cosine_slack
 
 # Cells are a little wider than the radius, so that rounding puts no neighbour two cells away.

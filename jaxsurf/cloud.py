@@ -8,10 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-
-def is_concrete(*arrays: Array | None) -> bool:
-    """True if none of the arrays is being traced, so that their values can be looked at."""
-    return not any(isinstance(a, jax.core.Tracer) for a in arrays)
+from .arguments import as_float, is_concrete, raise_at
 
 
 class PointCloud(eqx.Module):
@@ -98,18 +95,3 @@ class PointCloud(eqx.Module):
     def permuted(self, order: Int[Array, " n"]) -> PointCloud:
         """The same cloud with row `order[i]` in place i."""
         return jax.tree.map(lambda a: a[order], self)
-
-
-def as_float(x) -> Float[Array, "..."]:
-    """The array as it is if it is of a floating-point type, else in the default one."""
-    x = jnp.asarray(x)
-    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
-
-
-def raise_at(bad: np.ndarray, message: str, values: np.ndarray) -> None:
-    """Raise a ValueError that names the first bad index, its value, and how many there are."""
-    where = np.flatnonzero(bad)
-    if where.size:
-        text = message.format(i=where[0], v=values[where[0]])
-        more = f" (and {where.size - 1} more)" if where.size > 1 else ""
-        raise ValueError(text + more)

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .cloud import PointCloud, is_concrete
+from .arguments import is_concrete
+from .cloud import PointCloud
 
 Value = float | Float[Array, "*m"] | Callable[[Float[Array, ""]], Float[Array, "*m"]]
 Where = Bool[Array, " n"] | Int[Array, " m"]

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.spatial import cKDTree
 
-from .cloud import PointCloud, is_concrete, raise_at
+from .arguments import is_concrete, raise_at
+from .cloud import PointCloud
 from .neighbors import Neighbors, check_count, check_spacing, nearest
 from .orient import check_one_sided, orient_normals, plane_normals
 

@@ -22,9 +22,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from .arguments import is_concrete
 from .borders import Border, find_border
 from .boundary import Closure, Source, check_pivots
-from .cloud import PointCloud, is_concrete
+from .cloud import PointCloud
 from .conditions import Condition, checked_conditions
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsurf.cloud import PointCloud, raise_at
+from jaxsurf.arguments import raise_at
+from jaxsurf.cloud import PointCloud
 from jaxsurf.formats import Contents, contents_of, meshio
 from jaxsurf.frames import estimate_normals
 from jaxsurf.shapes.closest import fit_surface

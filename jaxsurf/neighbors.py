@@ -11,6 +11,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from .arguments import is_concrete, raise_at
 from .checks import (
     LINK,
     RINGS,
@@ -21,7 +22,7 @@ from .checks import (
     query,
     two_sheets,
 )
-from .cloud import PointCloud, is_concrete, raise_at
+from .cloud import PointCloud
 
 # A way along the surface longer than this times the chord leads around a gap; around a right
 # angle it is at most 1.41.

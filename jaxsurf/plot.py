@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from jaxsurf.cloud import PointCloud, raise_at
+from jaxsurf.arguments import raise_at
+from jaxsurf.cloud import PointCloud
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsurf.cloud import PointCloud, raise_at
+from jaxsurf.arguments import raise_at
+from jaxsurf.cloud import PointCloud
 from jaxsurf.shapes.order import sort_points
 from jaxsurf.shapes.sampling import Project, ideal_spacing, relax
 

@@ -17,7 +17,8 @@ from jax import lax
 from jaxtyping import Array, Float
 from scipy import ndimage
 
-from jaxsurf.cloud import PointCloud, is_concrete, raise_at
+from jaxsurf.arguments import is_concrete, raise_at
+from jaxsurf.cloud import PointCloud
 from jaxsurf.shapes.order import sort_points
 from jaxsurf.shapes.sampling import Project, quasi_uniform
 

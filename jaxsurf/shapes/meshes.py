@@ -14,7 +14,8 @@ from numpy import ndarray as Array
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from jaxsurf.cloud import PointCloud, raise_at
+from jaxsurf.arguments import raise_at
+from jaxsurf.cloud import PointCloud
 from jaxsurf.shapes.closest import ClosestPoint, fit_surface
 from jaxsurf.shapes.order import sort_cloud
 from jaxsurf.shapes.sampling import ideal_spacing, quasi_uniform

@@ -5,7 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsurf.cloud import PointCloud, is_concrete, raise_at
+from jaxsurf.arguments import is_concrete, raise_at
+from jaxsurf.cloud import PointCloud
 
 # 16 bits an axis tell 65,536 steps along the longest side apart: finer than any surface cloud
 # that fits in memory, and a key of at most 48 bits.

@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
-from jaxsurf.cloud import PointCloud, raise_at
+from jaxsurf.arguments import raise_at
+from jaxsurf.cloud import PointCloud
 
 Project = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..cloud import is_concrete
+from ..arguments import is_concrete
 from ..stencils.stencil import AbstractOperator, check_scalar
 from . import invariant
 from .invariant import Subspace

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..arguments import is_concrete
 from ..boundary import close
 from ..build import choose_neighbors
-from ..cloud import PointCloud, is_concrete
+from ..cloud import PointCloud
 from ..conditions import dirichlet
 from ..neighbors import Neighbors
 from ..operators import laplace_beltrami, surface_gradient

@@ -14,8 +14,8 @@ import optimistix as optx
 import scipy.sparse
 from jaxtyping import Array, Float
 
+from ..arguments import is_concrete
 from ..boundary import Closure
-from ..cloud import is_concrete
 from ..stencils.stencil import AbstractOperator, Stencil, check_scalar
 from .krylov import BiCGStab
 from .padded import matching_layout

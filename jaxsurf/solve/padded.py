@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float, Int
 
-from ..cloud import is_concrete
+from ..arguments import is_concrete
 from ..stencils.stencil import AbstractOperator, Composition, Stencil
 
 # An entry added by a scatter costs about as much as this many padded slots.

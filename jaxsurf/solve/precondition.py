@@ -11,8 +11,8 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float
 
+from ..arguments import is_concrete
 from ..boundary import Closure
-from ..cloud import is_concrete
 from ..stencils.stencil import AbstractOperator, Composition, Stencil, check_scalar
 from .padded import Layout, PaddedMatrix, incoming_layout
 from .reduced import annihilates_constants, reduced_matrix

@@ -9,8 +9,8 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..arguments import is_concrete
 from ..boundary import Closure
-from ..cloud import is_concrete
 from ..stencils.stencil import AbstractOperator, check_scalar
 from .krylov import BiCGStab
 from .padded import matching_layout

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 from tqdm import tqdm
 
-from ..cloud import is_concrete
+from ..arguments import is_concrete
 
 _COUNTS = ("num_accepted_steps", "num_rejected_steps", "num_steps")
 

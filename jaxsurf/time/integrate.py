@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, PyTree
 
-from ..cloud import as_float
+from ..arguments import as_float
 from .checkpoint import Checkpoint, integrate_in_parts
 from .pde import AbstractEvolution
 from .run import Run

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from ..arguments import is_concrete
 from ..boundary import Closure
-from ..cloud import is_concrete
 from ..stencils.stencil import AbstractOperator, Stencil
 
 Field = Float[Array, "n *c"]

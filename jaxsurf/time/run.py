@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from ..cloud import as_float, is_concrete, raise_at
+from ..arguments import as_float, is_concrete, raise_at
 from .chebyshev import Loop
 from .explicit import RKC2
 from .implicit import IMEX

@@ -1,0 +1,193 @@
+"""What public functions ask of their arguments, and how they say what is wrong with them.
+
+A wrong type is a `TypeError`, a wrong shape or value a `ValueError`; both name the argument, what
+it was and what is needed. Values are looked at only where arrays are concrete.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+
+def is_concrete(*arrays: Any) -> bool:
+    """True if none of the arrays is being traced, so that their values can be looked at."""
+    return not any(isinstance(a, jax.core.Tracer) for a in arrays)
+
+
+def raise_at(bad: np.ndarray, message: str, values: np.ndarray) -> None:
+    """Raise a ValueError that names the first bad index, its value, and how many there are."""
+    where = np.flatnonzero(bad)
+    if where.size:
+        text = message.format(i=where[0], v=values[where[0]])
+        more = f" (and {where.size - 1} more)" if where.size > 1 else ""
+        raise ValueError(text + more)
+
+
+def as_float(x: Any, name: str = "array") -> Float[Array, "..."]:
+    """The array as it is if it is of a floating-point type, else in the default one.
+
+    Raises:
+        TypeError: what is no array of real numbers: complex numbers, text, objects, ragged lists.
+    """
+    if not isinstance(x, jax.Array):
+        try:
+            given = np.asarray(x)
+        except ValueError as error:  # ragged
+            raise TypeError(f"{name} is no array of numbers: {error}") from None
+        if given.dtype.kind not in "fiub" and not jnp.issubdtype(given.dtype, jnp.floating):
+            raise TypeError(f"{name} is {_described(x, given)}, expected an array of real numbers")
+        x = jnp.asarray(given)
+    if jnp.issubdtype(x.dtype, jnp.complexfloating):
+        raise TypeError(f"{name} is complex ({x.dtype}), expected real numbers")
+    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
+
+
+def finite(x: Array, name: str) -> Array:
+    """The array, of which every concrete entry must be a finite number.
+
+    Raises:
+        ValueError: names the first row with an entry that is not.
+    """
+    if is_concrete(x):
+        values = np.asarray(x)
+        good = np.isfinite(values)
+        if values.ndim == 0 and not good:
+            raise ValueError(f"{name} is {values}, expected a finite number")
+        if not good.all():
+            bad = ~good.reshape(len(values), -1).all(axis=1)
+            raise_at(bad, f"{name} is not finite at point {{i}}: {{v}}", values)
+    return x
+
+
+def whole(value: Any, name: str, *, least: int | None = None, most: int | None = None) -> int:
+    """A whole number as an `int`, within bounds.
+
+    Raises:
+        TypeError: not a whole number, like 2.5, True or '3'.
+        ValueError: out of bounds (both numbers given).
+    """
+    try:
+        if isinstance(value, bool | np.bool_):
+            raise TypeError
+        number = operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name} is {_short(value)}, expected a whole number") from None
+    if least is not None and number < least:
+        raise ValueError(f"{name} = {number}, at least {least} is needed")
+    if most is not None and number > most:
+        raise ValueError(f"{name} = {number}, at most {most} is possible")
+    return number
+
+
+def real(
+    value: Any,
+    name: str,
+    *,
+    above: float = -math.inf,
+    below: float = math.inf,
+    least: float = -math.inf,
+    most: float = math.inf,
+) -> Any:
+    """A real number, returned as it came: finite and within bounds if it is concrete.
+
+    Raises:
+        TypeError: not a number: text, None, an array of several, a complex number.
+        ValueError: not finite, or out of bounds (value and bound given).
+    """
+    if isinstance(value, str | bytes | bool | np.bool_ | None.__class__) or np.ndim(value) != 0:
+        raise TypeError(f"{name} is {_short(value)}, expected a real number")
+    as_float(value, name)
+    if is_concrete(value):
+        number = float(value)
+        bounds = (
+            (above, "above", number > above), (below, "below", number < below),
+            (least, "at least", number >= least), (most, "at most", number <= most),
+        )  # fmt: skip
+        wanted = [f"{word} {b:g}" for b, word, _ in bounds if math.isfinite(b)]
+        if not (math.isfinite(number) and all(ok for b, _, ok in bounds if math.isfinite(b))):
+            what = " and ".join(wanted) if wanted else "a finite number"
+            raise ValueError(f"{name} = {number:g}, expected {what}")
+    return value
+
+
+def instance(value: Any, kinds: type | tuple[type, ...], name: str, hint: str = "") -> Any:
+    """The value, which must be of one of these classes.
+
+    Raises:
+        TypeError: names its class and those needed, with a hint at the way from one to the other.
+    """
+    if not isinstance(value, kinds):
+        kinds = kinds if isinstance(kinds, tuple) else (kinds,)
+        needed = " or ".join(kind.__name__.removeprefix("Abstract") for kind in kinds)
+        more = f": {hint}" if hint else ""
+        raise TypeError(f"{name} is {_short(value)}, expected a {needed}{more}")
+    return value
+
+
+def mask(value: Any, n: int, name: str) -> Bool[Array, " n"]:
+    """A mask over n points.
+
+    Raises:
+        TypeError: not of type bool, like a list of indices.
+        ValueError: another length than n (both given).
+    """
+    given = value if isinstance(value, jax.Array) else np.asarray(value)
+    if given.dtype != bool:
+        what = _described(value, given)
+        raise TypeError(f"{name} is {what}, expected a mask: one bool for each of {n} points")
+    if given.shape != (n,):
+        raise ValueError(f"{name} has shape {given.shape}, expected ({n},)")
+    return jnp.asarray(given)
+
+
+def indices_of(where: Any, n: int | None, name: str) -> Int[np.ndarray, " m"]:
+    """Points named by a mask over n points or by their indices, as indices in the order given.
+
+    Args:
+        where: concrete.
+        n: number of points; None where it is not known yet, which then is not checked.
+
+    Raises:
+        TypeError: traced, or neither a mask nor indices.
+        ValueError: a mask of another length, an index out of range or given twice.
+    """
+    if not is_concrete(where):
+        raise TypeError(f"{name} must be concrete: which points it names decides shapes")
+    given = np.asarray(where)
+    if given.ndim != 1 or not (given.dtype.kind in "bui" or given.size == 0):
+        raise TypeError(
+            f"{name} is {_described(where, given)}, expected a mask over the points or indices, 1-D"
+        )
+    if given.dtype == bool:
+        if n is not None and len(given) != n:
+            raise ValueError(f"{name} is a mask of {len(given)} points, there are {n}")
+        return np.flatnonzero(given).astype(np.int32)
+    if n is not None:
+        raise_at((given < 0) | (given >= n), f"{name} names point {{v}}, there are {n}", given)
+    unique, count = np.unique(given, return_counts=True)
+    if count.max(initial=1) > 1:
+        raise ValueError(f"{name} names point {unique[np.argmax(count)]} {count.max()} times")
+    return given.astype(np.int32)
+
+
+def _short(value: Any) -> str:
+    """A value as it is told in a message."""
+    if hasattr(value, "shape") and hasattr(value, "dtype") and np.ndim(value) > 0:
+        return _described(value, value)
+    text = repr(value)
+    kind = type(value).__name__
+    return f"{text} ({kind})" if len(text) <= 40 else f"a {kind}"
+
+
+def _described(value: Any, array: Any) -> str:
+    if isinstance(value, str | bytes) or value is None:
+        return _short(value)
+    kind = {"O": "objects", "U": "text", "S": "text"}.get(array.dtype.kind, str(array.dtype))
+    return f"an array of {kind} of shape {array.shape}"

@@ -1,7 +1,7 @@
 """A corpus of malformed input: what users get wrong, and what they must be told.
 
-One module for each part of the package, each with a list `CASES`; `tests/test_malformed.py` runs them
-all, and checks that no public function is left out.
+One module for each part of the package, each with a list `CASES`; `tests/test_malformed.py` runs
+them all, and checks that no public function is left out.
 """
 
 from __future__ import annotations

@@ -1,5 +1,7 @@
 """What several test files share: clouds, fields with known derivatives, central differences."""
 
+import contextlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,35 @@ import numpy as np
 import jaxsurf as js
 
 METHODS = [js.DCPSE(order=2), js.DCPSE(order=4), js.GFDM(degree=2), js.GFDM(degree=4)]
+
+
+_COUNTS: list[list[str]] = []
+
+
+def _note_compilation(event, _, **about):
+    if event == "/jax/core/compile/backend_compile_duration":
+        for names in _COUNTS:
+            names.append(str(about.get("fun_name", "?")))
+
+
+jax.monitoring.register_event_duration_secs_listener(_note_compilation)
+
+
+@contextlib.contextmanager
+def count_compilations():
+    """Names of the programs compiled within the block, one entry each: `len(names)` counts them.
+
+    Example:
+        >>> with count_compilations() as names:
+        ...     laplacian(u)
+        >>> assert not names, names
+    """
+    names: list[str] = []
+    _COUNTS.append(names)
+    try:
+        yield names
+    finally:
+        _COUNTS.remove(names)
 
 
 def label(method) -> str:

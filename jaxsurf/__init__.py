@@ -16,6 +16,7 @@ from .cells import search_neighbors as search_neighbors
 from .cloud import PointCloud as PointCloud
 from .conditions import Condition as Condition
 from .conditions import dirichlet as dirichlet
+from .conditions import free as free
 from .conditions import neumann as neumann
 from .conditions import robin as robin
 from .curvature import gauss_curvature as gauss_curvature

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
@@ -29,7 +30,7 @@ from .conditions import Condition, checked_conditions
 from .neighbors import Neighbors, nearest_of
 from .stencils.gfdm import GFDM
 from .stencils.method import AbstractMethod
-from .stencils.stencil import Stencil
+from .stencils.stencil import AbstractOperator, Stencil
 from .stencils.targets import Gradient
 
 # The factor of an unknown value has to be more than this share of its terms.
@@ -69,6 +70,8 @@ class Closure(eqx.Module):
         indices: free points that each bound value depends on, `(k, m)`.
         weights: with which weight, `(k, m)`; zero in padded slots.
         sources: prescribed values.
+        declared: True at points that some condition names, those of `free` included, `(n,)`;
+            None: the bound points.
     """
 
     n: int = eqx.field(static=True)
@@ -76,6 +79,7 @@ class Closure(eqx.Module):
     indices: Int[Array, "k m"]
     weights: Float[Array, "k m"]
     sources: tuple[Source, ...] = ()
+    declared: Bool[Array, " n"] | None = None
 
     @property
     def m(self) -> int:
@@ -173,7 +177,8 @@ def close(
     other. Dirichlet conditions need no stencil, and hold on any set of points.
 
     Args:
-        cloud: n points with unit normals. Points under no condition are free.
+        cloud: n points with unit normals. Points under no condition are free; on the border of
+            the surface they have to be named by `free`, or solvers refuse the operator.
         conditions: one or several; together they may name a point twice only if they agree.
         neighbors: lists for all n points, of which the free ones are used; if None, the
             nearest free points are searched for (host only).
@@ -205,15 +210,16 @@ def close(
         True
     """
     conditions, owner = checked_conditions(cloud, conditions)
-    bound = np.concatenate([c.where[own] for c, own in zip(conditions, owner)])
-    free = cloud.host_active.copy()
-    free[bound] = False
+    free, declared = cloud.host_active.copy(), np.zeros(cloud.n, bool)
+    for condition in conditions:
+        declared[condition.where] = True
+        free[condition.where] &= condition.is_free
     dtype = cloud.points.dtype
 
     parts, sources, start = [], [], 0
     for condition, own in zip(conditions, owner):
         rows, m = condition.where[own], int(own.sum())
-        if not m:
+        if condition.a is None or not m:  # free
             continue
         a = jnp.broadcast_to(condition.a, condition.m)[own].astype(dtype)
         if condition.b is None:
@@ -235,12 +241,43 @@ def close(
         place = jnp.arange(start, start + m)
         sources.append(Source(place, 1 / pivot, jnp.asarray(np.flatnonzero(own)), condition))
         start += m
-    rows, indices, weights = stacked(parts, int(np.argmax(free)))
-    return Closure(cloud.n, rows, indices, weights, tuple(sources))
+    rows, indices, weights = stacked(parts, int(np.argmax(free)), dtype)
+    return Closure(cloud.n, rows, indices, weights, tuple(sources), jnp.asarray(declared))
 
 
-def stacked(parts, free: int):
+def check_border(operator: AbstractOperator, conditions: Closure | None) -> None:
+    """Refuse an operator on a surface with a border about which nothing is said.
+
+    Without a condition its stencils there are one-sided, and what it is used for is not well
+    posed: modes grow without bound. Looks at concrete arrays only.
+
+    Raises:
+        ValueError: names a border point under no condition, how many there are, and the two ways
+            out: a condition, or `free`.
+    """
+    border = operator.border
+    known = None if conditions is None else (conditions.declared, conditions.rows)
+    if border is None or not is_concrete(*jax.tree.leaves((border, known))):
+        return
+    left = np.array(border)
+    if conditions is not None:
+        if conditions.n != operator.n:
+            raise ValueError(f"conditions for {conditions.n} points, the operator has {operator.n}")
+        declared = conditions.bound if conditions.declared is None else conditions.declared
+        left &= ~np.asarray(declared)
+    if left.any():
+        raise ValueError(
+            f"point {np.argmax(left)} lies on the border and is under no condition "
+            f"({int(left.sum())} such points), so that modes may grow there without bound. Close "
+            "the border, conditions=js.close(cloud, [js.neumann(...), ...]), or say that it is "
+            "free: js.close(cloud, js.free(cloud.boundary))"
+        )
+
+
+def stacked(parts, free: int, dtype):
     """One table of rows, indices and weights; padding refers to a free point."""
+    nothing = (np.zeros(0, np.int32), jnp.zeros((0, 0), jnp.int32), jnp.zeros((0, 0), dtype))
+    parts = parts or [nothing]
     k = max(len(slots) for _, slots, _ in parts)
     padding = lambda x: ((0, k - len(x)), (0, 0))
     rows = np.concatenate([rows for rows, _, _ in parts])

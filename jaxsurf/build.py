@@ -71,7 +71,10 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
         weights = stencil_weights(cloud, neighbors, method, target)
     values, diagnostics = weights
     components = values.shape[1:-1]
-    stencil = Stencil(neighbors.indices.T, values, components, (), diagnostics)
+    border = cloud.boundary
+    if border is not None and cloud.active is not None:
+        border = border & cloud.active
+    stencil = Stencil(neighbors.indices.T, values, components, (), diagnostics, border)
     if throw and is_concrete(values):
         _check(stencil, neighbors, method, target, cloud.dim)
     return stencil

@@ -23,21 +23,21 @@ class Condition(eqx.Module):
         where: indices of the points, `(m,)`.
         value: g: a number, `(m,)`, `(m, c)` for fields of c components, or a function of time
             that returns one of these.
-        a: factor of the value, scalar or `(m,)`.
+        a: factor of the value, scalar or `(m,)`; None if the points are free.
         b: factor of the conormal derivative, scalar or `(m,)`; None for a Dirichlet condition.
         conormals: outward conormals $\nu$, `(m, d)`; None to take those of the border.
     """
 
     where: Int[np.ndarray, " m"]
     value: Array | Callable
-    a: Array
+    a: Array | None
     b: Array | None
     conormals: Float[Array, "m d"] | None
 
     def __init__(self, where, value, *, a, b, conormals=None):
         self.where = _indices(where)
         self.value = value if callable(value) else jnp.asarray(value)
-        self.a = jnp.asarray(a)
+        self.a = None if a is None else jnp.asarray(a)
         self.b = None if b is None else jnp.asarray(b)
         self.conormals = None if conormals is None else jnp.asarray(conormals)
 
@@ -56,6 +56,11 @@ class Condition(eqx.Module):
     def m(self) -> int:
         """Number of points."""
         return len(self.where)
+
+    @property
+    def is_free(self) -> bool:
+        """True if the points are bound by nothing: made by `free`."""
+        return self.a is None
 
     def at(self, t) -> Array:
         """The values g at a time."""
@@ -140,6 +145,30 @@ def robin(
     return Condition(where, value, a=a, b=b, conormals=conormals)
 
 
+def free(where: Where) -> Condition:
+    """No condition: the equation itself is to hold at these points of a border.
+
+    Stencils there are one-sided. That serves where the equation says enough (outflow of a
+    transport equation, a least-squares fit), and is unstable for heat and waves; hence solvers
+    refuse border points about which nothing is said.
+
+    Args:
+        where: mask `(n,)` or indices `(m,)`, concrete.
+
+    Returns:
+        The condition, for `close` and `with_ghosts`.
+
+    Raises:
+        ValueError: a point named twice.
+
+    Example:
+        >>> square = js.graph(lambda x, y: 0.0 * x, (7, 7))
+        >>> js.close(square, js.free(square.boundary)).m
+        0
+    """
+    return Condition(where, 0.0, a=None, b=None)
+
+
 # --- what a set of conditions says ---------------------------------------------------------
 
 
@@ -165,7 +194,8 @@ def checked_conditions(
         fresh = owner[where] < 0
         owner[where[fresh]], place[where[fresh]] = number, np.flatnonzero(fresh)
         owned.append(fresh)
-    if not np.any(on & (owner < 0)):
+    free = [number for number, condition in enumerate(conditions) if condition.is_free]
+    if not np.any(on & ((owner < 0) | np.isin(owner, free))):
         raise ValueError(f"all {int(on.sum())} points are bound, no free point is left")
     return conditions, owned
 
@@ -189,7 +219,9 @@ def _check_agreement(conditions, number, owner, place) -> None:
 def _differ(one: Condition, i, two: Condition, j) -> Bool[np.ndarray, " p"]:
     """Whether two conditions differ at p points: points i of the first, j of the second."""
     everywhere, nowhere = np.ones(len(i), bool), np.zeros(len(i), bool)
-    if (one.b is None) != (two.b is None) or (one.conormals is None) != (two.conormals is None):
+    if one.is_free != two.is_free or (one.b is None) != (two.b is None):
+        return everywhere
+    if (one.conormals is None) != (two.conormals is None):
         return everywhere
     if callable(one.value) or callable(two.value):
         if one.value is not two.value:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import jax
 import jax.numpy as jnp
@@ -61,8 +62,9 @@ def with_ghosts(
         throw: check the factors of the images.
 
     Returns:
-        The enlarged cloud, its first n points the old ones and the ghosts its new border, and
-        the closure for its fields (`Closure.extend` fills in a field of the n points).
+        The enlarged cloud, its first n points the old ones, the ghosts its new border (with what
+        is left of the old one under no condition), and the closure for its fields
+        (`Closure.extend` fills in a field of the n points).
 
     Accuracy: images are off by O(h³) (Neumann, Robin with b ≠ 0) and O(h²) (Dirichlet), so that
     solutions converge with second order whatever the method (`tests/test_boundary.py`); exact
@@ -87,17 +89,26 @@ def with_ghosts(
     conditions, owned = checked_conditions(cloud, conditions)
     with jax.ensure_compile_time_eval():  # of the points alone; values may be traced
         border = find_border(cloud) if border is None else border
+    _check_places(conditions, owned, border)
+    declared = np.zeros(cloud.n, bool)
+    for condition in conditions:
+        declared[condition.where] = True
+    binding = [not condition.is_free for condition in conditions]
+    conditions, owned = list(compress(conditions, binding)), list(compress(owned, binding))
     owner, place = np.full(cloud.n, -1), np.zeros(cloud.n, int)
     for number, (condition, own) in enumerate(zip(conditions, owned)):
         owner[condition.where[own]], place[condition.where[own]] = number, np.flatnonzero(own)
-    _check_places(conditions, owned, border)
-
     with jax.ensure_compile_time_eval():
         images = _reflected(cloud, border, owner, _reach(cloud, border, method, depth))
     if not len(images.parent):
         raise ValueError("no border point is under a condition: there is nothing to reflect")
     images = images.only(_apart(cloud, images), cloud.n)
-    return _enlarged(cloud, images, conditions, owned, place, throw)
+    bare = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
+    bare = bare & (owner < 0)  # remains a border
+    rows, indices, weights, sources = _values(cloud, images, conditions, owned, place, throw)
+    grown = lambda mask: jnp.asarray(np.pad(mask, (0, len(images.parent)), constant_values=True))
+    wide = _joined(cloud, images, grown(bare))
+    return wide, Closure(wide.n, rows, indices, weights, sources, grown(declared))
 
 
 @dataclass(frozen=True)
@@ -290,7 +301,8 @@ def _apart(cloud, images) -> Bool[np.ndarray, " m"]:
 # --- their values --------------------------------------------------------------------------
 
 
-def _enlarged(cloud, images, conditions, owned, place, throw) -> tuple[PointCloud, Closure]:
+def _values(cloud, images, conditions, owned, place, throw):
+    """Rows, indices, weights and sources of the closure."""
     n, m, dtype = cloud.n, len(images.parent), cloud.points.dtype
     second, parent, root = images.ancestors(n)
 
@@ -340,14 +352,8 @@ def _enlarged(cloud, images, conditions, owned, place, throw) -> tuple[PointClou
 
     indices = jnp.asarray(np.concatenate([np.full(first, free), depends]).astype(np.int32))
     weights = jnp.concatenate([jnp.zeros(first, dtype), total])
-    closure = Closure(
-        n + m,
-        jnp.asarray(rows.astype(np.int32)),
-        indices[None],
-        weights[None],
-        tuple(entries.source(c) for entries, c in zip(sources, conditions) if entries.slots),
-    )
-    return _joined(cloud, images), closure
+    sources = tuple(entries.source(c) for entries, c in zip(sources, conditions) if entries.slots)
+    return jnp.asarray(rows.astype(np.int32)), indices[None], weights[None], sources
 
 
 def _carried(x, m: int, pick, share) -> Float[Array, " p"]:
@@ -379,7 +385,7 @@ class _Entries:
         return Source(slots, jnp.concatenate(self.factors), picks, condition)
 
 
-def _joined(cloud, images) -> PointCloud:
+def _joined(cloud, images, border) -> PointCloud:
     m = len(images.parent)
     pad = lambda x, value: None if x is None else jnp.concatenate([x, jnp.full(m, value, x.dtype)])
     root = images.ancestors(cloud.n)[2]
@@ -387,7 +393,7 @@ def _joined(cloud, images) -> PointCloud:
     return PointCloud(
         jnp.concatenate([cloud.points, jnp.asarray(images.points, cloud.points.dtype)]),
         jnp.concatenate([cloud.normals, jnp.asarray(images.normals, cloud.points.dtype)]),
-        boundary=jnp.arange(cloud.n + m) >= cloud.n,
+        boundary=border,
         active=pad(cloud.active, True),
         spacing=None if spacing is None else jnp.concatenate([spacing, spacing[root]]),
     )

@@ -120,7 +120,8 @@ def surface_divergence(
         True
     """
     gradient = build(cloud, neighbors, method, Gradient(), throw)
-    return Stencil(gradient.indices, gradient.weights, (), (cloud.dim,), gradient.diagnostics)
+    weights, known = gradient.weights, (gradient.diagnostics, gradient.border)
+    return Stencil(gradient.indices, weights, (), (cloud.dim,), *known)
 
 
 def directional_derivative(
@@ -151,7 +152,7 @@ def directional_derivative(
     gradient = build(cloud, neighbors, method, Gradient(), throw)
     direction = _field(direction, (cloud.n, cloud.dim), "direction")
     weights = jnp.einsum("na,kan->kn", direction, gradient.weights)
-    return Stencil(gradient.indices, weights, diagnostics=gradient.diagnostics)
+    return Stencil(gradient.indices, weights, (), (), gradient.diagnostics, gradient.border)
 
 
 def diffusion(
@@ -201,7 +202,7 @@ def diffusion(
         shapes = f"({cloud.n},) or ({cloud.n}, {cloud.dim}, {cloud.dim})"
         raise ValueError(f"diffusivity has shape {d.shape}, expected {shapes}")
     weights = weights.at[0].set(-jnp.sum(weights[1:], axis=0))
-    return Stencil(stencil.indices, weights, diagnostics=stencil.diagnostics)
+    return Stencil(stencil.indices, weights, (), (), stencil.diagnostics, stencil.border)
 
 
 def biharmonic(

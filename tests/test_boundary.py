@@ -9,6 +9,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 import jaxsurf as js
+from jaxsurf.boundary import check_border
 
 from .helpers import check_derivative
 
@@ -165,6 +166,101 @@ def test_values_per_component():
     np.testing.assert_array_equal(filled[border], values)
     with pytest.raises(ValueError, match="the field has none"):
         closure(jnp.zeros(cloud.n))
+
+
+@pytest.mark.core
+def test_points_that_are_declared_free():
+    cloud = square(9)
+    border = np.asarray(cloud.boundary)
+    left = np.asarray(cloud.points[:, 0]) < -1 + 1e-9
+    u = jnp.asarray(np.random.default_rng(0).normal(size=cloud.n))
+    nothing = js.close(cloud, js.free(border))
+    assert nothing.m == 0 and not nothing.bound.any()
+    np.testing.assert_array_equal(nothing.declared, border)
+    for filled in (nothing(u), nothing.homogeneous(u), nothing.restrict(u), nothing.stencil(u)):
+        np.testing.assert_array_equal(filled, u)
+    np.testing.assert_array_equal(nothing(jnp.stack([u, u], axis=1), 0.3)[:, 1], u)
+    np.testing.assert_array_equal(nothing.offset(), 0 * u)
+    assert (nothing.to_scipy() != scipy.sparse.identity(cloud.n)).nnz == 0
+    # Some bound, the others free: those that are bound are bound as without the others.
+    alone = js.close(cloud, js.dirichlet(left, 2.0))
+    both = js.close(cloud, [js.free(border & ~left), js.dirichlet(left, 2.0)])
+    np.testing.assert_array_equal(both(u), alone(u))
+    np.testing.assert_array_equal(both.declared, border)
+    np.testing.assert_array_equal(alone.declared, left)
+    with pytest.raises(ValueError, match="do not agree"):
+        js.close(cloud, [js.free(border), js.dirichlet(left)])
+
+
+@pytest.mark.core
+def test_ghosts_beside_points_that_are_free():
+    cloud = square(9)
+    border = np.asarray(cloud.boundary)
+    left = np.asarray(cloud.points[:, 0]) < -1 + 1e-9
+    u = cloud.points[:, 0] ** 2
+    some, without = js.with_ghosts(cloud, js.neumann(left))
+    same, closure = js.with_ghosts(cloud, [js.neumann(left), js.free(border & ~left)])
+    np.testing.assert_array_equal(same.points, some.points)
+    np.testing.assert_array_equal(closure.extend(u), without.extend(u))
+    # What has no images is a border as before.
+    np.testing.assert_array_equal(same.boundary[: cloud.n], border & ~left)
+    assert same.boundary[cloud.n :].all() and same.n > cloud.n
+    operator = js.laplace_beltrami(same, method=js.GFDM(degree=2))
+    check_border(operator, closure)
+    with pytest.raises(ValueError, match="under no condition"):
+        check_border(operator, without)
+    with pytest.raises(ValueError, match="nothing to reflect"):
+        js.with_ghosts(cloud, js.free(border))
+
+
+@pytest.mark.core
+def test_a_border_about_which_nothing_is_said():
+    cloud = square(9)
+    border = np.asarray(cloud.boundary)
+    near = js.find_neighbors(cloud, k=15)
+    method = js.GFDM(degree=2)
+    gradient = js.surface_gradient(cloud, near, method=method)
+    laplacian = js.laplace_beltrami(cloud, near, method=method)
+    operators = [
+        laplacian,
+        laplacian.scaled(2.0).shifted(1.0),
+        laplacian.transpose(),
+        js.directional_derivative(cloud, jnp.ones(3), neighbors=near, method=method),
+        js.diffusion(cloud, jnp.ones(cloud.n), neighbors=near, method=method),
+        js.surface_divergence(cloud, near, method=method) @ gradient,
+        js.Stencil(laplacian.indices, laplacian.weights) @ laplacian,
+    ]
+    left = np.flatnonzero(border)[3:]
+    words = rf"point {left[0]} lies on the border .* \({len(left)} such points\).*js.free\("
+    for operator in operators:
+        np.testing.assert_array_equal(operator.border, border)
+        check_border(operator, js.close(cloud, js.free(border)))
+        check_border(operator, js.close(cloud, js.neumann(border)))
+        with pytest.raises(ValueError, match=rf"point 0 lies on .* \({border.sum()} such"):
+            check_border(operator, None)
+        with pytest.raises(ValueError, match=words):
+            check_border(operator, js.close(cloud, js.dirichlet(np.flatnonzero(border)[:3])))
+    with pytest.raises(ValueError, match="conditions for 81 points, the operator has 49"):
+        small = square(7)
+        check_border(js.laplace_beltrami(small), js.close(cloud, js.free(border)))
+    # Nothing to say of closed surfaces, of bare stencils, of points that are switched off, and of
+    # traced borders.
+    check_border(js.Stencil(laplacian.indices, laplacian.weights), None)
+    eqx.filter_jit(lambda operator: check_border(operator, None))(laplacian)
+    off = js.PointCloud(cloud.points, cloud.normals, boundary=border, active=~border)
+    check_border(js.laplace_beltrami(off, js.choose_neighbors(off)), None)
+    with pytest.raises(ValueError, match="under no condition"):
+        jax.jit(lambda u: check_border(laplacian @ laplacian, None))(jnp.zeros(cloud.n))
+
+
+@pytest.mark.core
+def test_the_border_is_saved(tmp_path):
+    cloud = square(7)
+    laplacian = js.laplace_beltrami(cloud, method=js.GFDM(degree=2))
+    laplacian.save(tmp_path / "a.npz")
+    np.testing.assert_array_equal(js.Stencil.load(tmp_path / "a.npz").border, cloud.boundary)
+    js.Stencil(laplacian.indices, laplacian.weights).save(tmp_path / "b.npz")
+    assert js.Stencil.load(tmp_path / "b.npz").border is None
 
 
 def test_great_circle_and_single_points():

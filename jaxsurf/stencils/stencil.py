@@ -14,8 +14,9 @@ import lineax as lx
 import numpy as np
 import scipy.sparse
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from ..arguments import is_concrete
 from .method import Diagnostics
 
 
@@ -45,6 +46,14 @@ class AbstractOperator(eqx.Module):
     def transpose(self) -> AbstractOperator:
         """The transposed operator, with the components taken and given exchanged."""
 
+    @property
+    def border(self) -> Bool[Array, " n"] | None:
+        """True at border points of the surface, which conditions should say something about.
+
+        None on closed surfaces, and where it is not known.
+        """
+        return None
+
     @abc.abstractmethod
     def to_scipy(self) -> scipy.sparse.csr_matrix:
         """CSR matrix acting on flattened fields (the components of a point stand together)."""
@@ -71,6 +80,7 @@ class Stencil(AbstractOperator):
         out_shape: `()` for scalar results, `(d,)` for a gradient.
         in_shape: `()` for scalar fields, `(d,)` for a divergence.
         diagnostics: how well each stencil is determined; None if unknown.
+        border: True at border points of the surface, `(n,)`; None if it has none.
 
     Differentiable: forward and reverse, in the weights and in the field.
     """
@@ -80,6 +90,7 @@ class Stencil(AbstractOperator):
     out_shape: tuple[int, ...] = eqx.field(static=True, default=())
     in_shape: tuple[int, ...] = eqx.field(static=True, default=())
     diagnostics: Diagnostics | None = None
+    border: Bool[Array, " n"] | None = None
 
     def __check_init__(self):
         shape = (self.k, *self.out_shape, *self.in_shape, self.n)
@@ -126,7 +137,8 @@ class Stencil(AbstractOperator):
         moved = jnp.moveaxis(moved.at[place, row].set(flat[order]), 1, -1)
         if self.out_shape and self.in_shape:
             moved = jnp.swapaxes(moved, 1, 2)
-        return Stencil(jnp.asarray(indices), moved, self.in_shape, self.out_shape)
+        shapes = (self.in_shape, self.out_shape)
+        return Stencil(jnp.asarray(indices), moved, *shapes, border=self.border)
 
     def to_scipy(self):
         p, q, n = math.prod(self.out_shape), math.prod(self.in_shape), self.n
@@ -166,6 +178,8 @@ class Stencil(AbstractOperator):
         }
         if self.diagnostics is not None:
             data |= {name: np.asarray(value) for name, value in vars(self.diagnostics).items()}
+        if self.border is not None:
+            data["border"] = np.asarray(self.border)
         with open(path, "wb") as file:
             np.savez(file, allow_pickle=False, **data)
 
@@ -185,9 +199,10 @@ class Stencil(AbstractOperator):
             indices, weights = jnp.asarray(data.pop("indices")), jnp.asarray(data.pop("weights"))
         except (OSError, EOFError, KeyError, ValueError, AttributeError) as error:
             raise ValueError(f"{path} does not hold a stencil: {error}") from error
+        border = jnp.asarray(data.pop("border")) if "border" in data else None
         extra = {name: jnp.asarray(value) for name, value in data.items()}
         diagnostics = Diagnostics(**extra) if extra else None
-        return cls(indices, weights, out_shape, in_shape, diagnostics)
+        return cls(indices, weights, out_shape, in_shape, diagnostics, border)
 
 
 class Composition(AbstractOperator):
@@ -213,6 +228,12 @@ class Composition(AbstractOperator):
     @property
     def out_shape(self):
         return self.outer.out_shape
+
+    @property
+    def border(self):
+        marked = [b for b in (self.inner.border, self.outer.border) if b is not None]
+        either = np.logical_or if is_concrete(*marked) else jnp.logical_or
+        return functools.reduce(either, marked) if marked else None
 
     def __call__(self, u):
         return self.outer(self.inner(u))

@@ -49,6 +49,39 @@ def as_float(x: Any, name: str = "array") -> Float[Array, "..."]:
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
 
 
+def on_host(x: Any, name: str = "array") -> np.ndarray:
+    """The array in NumPy and double precision, for what is done on the host.
+
+    Raises:
+        TypeError: traced, or no array of real numbers.
+    """
+    if not is_concrete(x):
+        raise TypeError(f"{name} must be concrete: give it from outside jit, vmap and grad")
+    if isinstance(x, jax.Array):
+        x = np.asarray(as_float(x, name))
+    try:
+        given = np.asarray(x)
+    except ValueError as error:  # ragged
+        raise TypeError(f"{name} is no array of numbers: {error}") from None
+    if given.dtype.kind not in "fiub" and not jnp.issubdtype(given.dtype, jnp.floating):
+        raise TypeError(f"{name} is {_described(x, given)}, expected an array of real numbers")
+    return given.astype(float)
+
+
+def in_range(values: Any, name: str) -> Any:
+    """The values, of which none may be so large that squares and cubes of lengths overflow.
+
+    Raises:
+        ValueError: names the first row with a number that is too large.
+    """
+    largest = float(np.finfo(float).max ** (1 / 3))
+    size = np.abs(np.atleast_1d(np.asarray(values, float)))
+    size = size.reshape(len(size), -1).max(axis=1, initial=0)
+    text = f"{name}: size {{v:.3g}} in row {{i}}, at most {largest:.3g} can be calculated with"
+    raise_at(size > largest, text, size)
+    return values
+
+
 def finite(x: Array, name: str) -> Array:
     """The array, of which every concrete entry must be a finite number.
 
@@ -175,6 +208,28 @@ def indices_of(where: Any, n: int | None, name: str) -> Int[np.ndarray, " m"]:
     if count.max(initial=1) > 1:
         raise ValueError(f"{name} names point {unique[np.argmax(count)]} {count.max()} times")
     return given.astype(np.int32)
+
+
+def differentiable(f: Any, name: str, *arguments: jax.ShapeDtypeStruct) -> Any:
+    """The shapes that a function returns, which must be one that JAX can trace.
+
+    Args:
+        f: of arrays of these shapes.
+        arguments: their shapes and types.
+
+    Raises:
+        TypeError: no function, or one that turns its arguments into NumPy arrays or numbers.
+    """
+    if not callable(f):
+        raise TypeError(f"{name} is {_short(f)}, expected a function")
+    try:
+        return jax.eval_shape(f, *arguments)
+    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+        what = str(error).splitlines()[0]
+        raise TypeError(
+            f"{name} cannot be traced by JAX; write it with jax.numpy in place of NumPy, math and"
+            f" conditions on values ({what})"
+        ) from None
 
 
 def _short(value: Any) -> str:

@@ -7,16 +7,26 @@ guarded against files that end early.
 
 from __future__ import annotations
 
+import codecs
 import io
 import re
+import tempfile
 from collections.abc import Callable
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
+
+from jaxsurf.arguments import instance, raise_at
+
+# Rows of three columns in text files are normals if they are this close to length one: what two
+# decimals leave.
+_UNIT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +48,12 @@ class Contents:
     notes: list[str] = field(default_factory=list)
 
 
-def contents_of(path: str | Path) -> Contents:
+def contents_of(path: str | Path, columns: str | None = None) -> Contents:
     """Contents of a file, by its suffix.
+
+    Args:
+        path: file.
+        columns: names of the columns of an XYZ file, see `jaxsurf.read`.
 
     Raises:
         OSError: no such file.
@@ -47,8 +61,13 @@ def contents_of(path: str | Path) -> Contents:
             the path.
         ImportError: meshio is needed and absent.
     """
-    path = Path(path)
-    reader = _READERS.get(path.suffix.lower())
+    path = Path(instance(path, (str, Path), "path"))
+    reader: Callable[[Path], Contents] | None = _READERS.get(path.suffix.lower())
+    if columns is not None:
+        instance(columns, str, "columns", "names with blanks between, like 'x y z value'")
+        if reader is not _xyz:
+            raise ValueError(f"{path}: columns belong to .xyz files, this is {path.suffix!r}")
+        reader = partial(_xyz, columns=columns)
     if reader is None:
         known = ", ".join(_READERS)
         raise ValueError(f"{path}: unknown suffix {path.suffix!r}; known are {known}")
@@ -184,21 +203,61 @@ def _off(path: Path) -> Contents:
     return Contents(x[:, :3], [np.array(run) for run in runs], x[:, 3:] if with_normals else None)
 
 
-def _xyz(path: Path) -> Contents:
-    rows = np.loadtxt(path, comments="#", ndmin=2)
-    columns = rows.shape[1]
-    if columns not in (2, 3, 4, 6):
+def _xyz(path: Path, columns: str | None = None) -> Contents:
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        text = file.read()
+    rows = np.loadtxt(io.StringIO(text), comments="#", ndmin=2)
+    count = rows.shape[1]
+    if columns is None:
+        # A first comment that names every column, as `write` leaves it.
+        first = text.lstrip().split("\n", 1)[0]
+        title = first[1:].split() if first.startswith("#") else []
+        if len(title) == count and title[:2] == ["x", "y"]:
+            columns = " ".join(title)
+    names = _guessed(rows) if columns is None else columns.split()
+    if len(names) != count:
+        raise ValueError(f"columns names {len(names)} ({' '.join(names)}), there are {count}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"columns names one twice: {' '.join(names)}")
+    column = dict(zip(names, rows.T, strict=True))
+    if not {"x", "y"} <= column.keys():
+        raise ValueError(f"columns must name x and y, not only {' '.join(names)}")
+    axes = [a for a in "xyz" if a in column]
+    points = np.stack([column.pop(a) for a in axes], axis=1)
+    parts = [a for a in ("nx", "ny", "nz") if a in column]
+    if parts and parts != ["n" + a for a in axes]:
+        raise ValueError(f"columns name {' '.join(parts)} of the normals of {' '.join(axes)}")
+    normals = np.stack([column.pop(a) for a in parts], axis=1) if parts else None
+    return Contents(points, normals=normals, fields=column)
+
+
+def _guessed(rows: Float[Array, "n c"]) -> list[str]:
+    """What the columns are, where their number and the length of the normals leave no doubt."""
+    known = {2: "x y", 3: "x y z", 4: "x y nx ny", 6: "x y z nx ny nz"}
+    count = rows.shape[1]
+    if count not in known:
         raise ValueError(
-            f"{columns} columns; expected x y [nx ny] in the plane or x y z [nx ny nz] in space"
+            f"{count} columns; expected x y [nx ny] in the plane or x y z [nx ny nz] in space. "
+            "Name others, as in columns='x y z value'"
         )
-    dim = 2 if columns in (2, 4) else 3
-    return Contents(rows[:, :dim], normals=rows[:, dim:] if columns > dim else None)
+    if count > 3:
+        last = rows[:, count // 2 :]
+        length = np.linalg.norm(last, axis=1)
+        other = "x y z value" if count == 4 else "x y z r g b"
+        raise_at(
+            ~(np.abs(length - 1) <= _UNIT),
+            f"{count} columns, of which the last {count // 2} are no unit normals: row {{i}} has "
+            f"length {{v:.4g}}, expected 1. Say what they are with columns='{other}' or "
+            f"columns='{known[count]}' (directions of any length)",
+            length,
+        )
+    return known[count].split()
 
 
 def _lines(path: Path):
     """Lines that say something, with their numbers; comments and continuations resolved."""
     pending = ""
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
         for number, line in enumerate(file, 1):
             line = pending + line.split("#", 1)[0].strip()
             if line.endswith("\\"):
@@ -234,14 +293,25 @@ def _through(reader: Callable, source):
         raise ValueError(f"not readable ({type(error).__name__}: {error})") from error
 
 
+def _bytes(path: Path) -> bytes:
+    return path.read_bytes().removeprefix(codecs.BOM_UTF8)
+
+
 def _ply(path: Path) -> Contents:
-    data = path.read_bytes()
-    end = data.find(b"end_header")
-    if not data.startswith(b"ply") or end < 0:
+    data = _bytes(path)
+    found = re.search(rb"\nend_header[ \t]*\r?\n", data)
+    if not data.startswith(b"ply") or found is None:
         raise ValueError("not a PLY file, or truncated within its header")
+    end = found.start() + 1
     # Both names are in use; meshio knows the first only.
     header = re.sub(rb"\bvertex_index\b", b"vertex_indices", data[:end])
+    # It takes unsigned bytes of a binary file for signed ones, and knows not all names of types.
+    for name, known in _PLY_TYPES.items():
+        header = re.sub(rb"(?m)^(\s*property\s+)%b\s" % name, rb"\1%b " % known, header)
     counts = {k.decode(): int(v) for k, v in re.findall(rb"element\s+(\w+)\s+(\d+)", header)}
+    for what in ("vertex", "face"):
+        # Checked before a reader reserves memory for what the header announces.
+        _complete(f"bytes of the element {what}", counts.get(what, 0), len(data))
     face = re.search(rb"element\s+face\b.*?\n((?:\s*property.*\n)*)", header)
     if b"format binary" in header and face and len(face[1].strip().splitlines()) > 1:
         # meshio would read these property after property instead of face after face.
@@ -255,26 +325,48 @@ def _ply(path: Path) -> Contents:
     return _contents(mesh)
 
 
+_PLY_TYPES = {b"uchar": b"uint8", b"char": b"int8", b"ushort": b"uint16", b"float64": b"double"}
+
+
 def _stl(path: Path) -> Contents:
-    data = path.read_bytes()
+    data = _bytes(path)
     announced = int(np.frombuffer(data[80:84], "<u4")[0]) if len(data) >= 84 else 0
     binary = len(data) == 84 + 50 * announced
     if not binary and not data.lstrip().startswith(b"solid"):
         _complete("bytes", 84 + 50 * announced, len(data))
     if not binary and b"endsolid" not in data[-1000:]:
         raise ValueError("truncated: no endsolid")
-    contents = _contents(_through(meshio().stl.read, path))
+    with _unmarked(path, data) as plain:
+        contents = _contents(_through(meshio().stl.read, plain))
     corners = 3 * sum(map(len, contents.faces))
     note = f"{corners} corners of triangles merged into {len(contents.points)} vertices"
     return Contents(contents.points, contents.faces, notes=[note])
 
 
 def _vtk(path: Path) -> Contents:
-    return _contents(_through(meshio().vtk.read, path))
+    data = _bytes(path)
+    # Checked before a reader reserves memory for what a line announces.
+    for count in re.findall(rb"(?m)^(?:POINTS|CELLS|POINT_DATA|CELL_DATA)\s+(\d+)", data):
+        _complete("entries", int(count), len(data))
+    with _unmarked(path, data) as plain:
+        return _contents(_through(meshio().vtk.read, plain))
 
 
 def _vtu(path: Path) -> Contents:
-    return _contents(_through(meshio().vtu.read, path))
+    with _unmarked(path, _bytes(path)) as plain:
+        return _contents(_through(meshio().vtu.read, plain))
+
+
+@contextmanager
+def _unmarked(path: Path, data: bytes):
+    """The file, or a copy without the mark of UTF-8 at its start: these readers need a file."""
+    if path.stat().st_size == len(data):
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / path.name
+        copy.write_bytes(data)
+        yield copy
 
 
 def _native(value: Array) -> Array:

@@ -6,12 +6,14 @@ import math
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from xml.sax.saxutils import escape
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsurf.arguments import raise_at
+from jaxsurf.arguments import in_range, instance, is_concrete, raise_at, real, whole
 from jaxsurf.cloud import PointCloud
 from jaxsurf.formats import Contents, contents_of, meshio
 from jaxsurf.frames import estimate_normals
@@ -30,11 +32,15 @@ def read(
     smooth: bool = True,
     degree: int = 4,
     seed: int = 0,
+    columns: str | None = None,
+    faces: bool = True,
+    largest_part: bool = False,
 ) -> PointCloud:
     """Point cloud from a triangle mesh or a list of points.
 
     OBJ, OFF and XYZ (columns `x y z` or `x y z nx ny nz`; `x y` or `x y nx ny` for curves in the
     plane) need no other package; PLY, STL, VTK and VTU need `pip install 'jaxsurf[files]'`.
+    Columns of an XYZ file are taken for normals only where all have length one.
 
     Normals are those in the file, scaled to length one. A mesh without them gives the side they
     point to by the order of its corners, and their direction comes from local polynomial fits
@@ -53,6 +59,11 @@ def read(
             triangles, right for sharp edges.
         degree: of the polynomials; that of the operators to be used.
         seed: of resampling.
+        columns: of an XYZ file, by name: x, y, z, nx, ny, nz, and any other name for a field
+            (see `read_fields`); as in 'x y z r g b'. If None, those that a first comment names
+            (`# x y z value`), or else what their number and the lengths of the normals say.
+        faces: False takes the vertices of a mesh as a list of points, whatever its faces.
+        largest_part: leave out faces until no edge has more than two, see `clean_mesh`.
 
     Returns:
         The vertices in the order of the file (`sort_cloud` sorts them), with `boundary` at the
@@ -64,7 +75,8 @@ def read(
         ValueError: the file is empty, truncated, of unknown kind or has no points; vertex
             numbers out of range, non-finite coordinates, zero normals, coinciding points of a
             cloud (named by index); edges of more than two triangles; a surface with one side
-            only; too few points. The message begins with the path.
+            only; too few points; columns that may be anything. The message begins with the path.
+        TypeError: an argument of the wrong kind.
         ImportError: meshio is needed and absent.
 
     Example:
@@ -75,35 +87,42 @@ def read(
         >>> js.read(path).points.shape
         (500, 3)
     """
-    contents = contents_of(path)
-    notes = list(contents.notes)
-    triangles = _triangulate(contents, notes)
-    for note in notes:
-        warnings.warn(f"{path}: {note}", stacklevel=2)
+    if n is not None:
+        whole(n, "n", least=1)
+    if spacing is not None:
+        real(spacing, "spacing", above=0)
+    whole(degree, "degree", least=1)
+    whole(seed, "seed", least=0)
+    for name, value in (("smooth", smooth), ("faces", faces), ("largest_part", largest_part)):
+        instance(value, (bool, np.bool_), name)
+    contents = contents_of(path, columns)
     try:
+        notes = list(contents.notes)
+        triangles = _triangulate(contents, notes) if faces else np.empty((0, 3), np.int64)
+        for note in notes:
+            warnings.warn(f"{path}: {note}", stacklevel=2)
         if not len(triangles):
             return _from_points(contents, n, spacing, degree)
-        vertices = contents.points
-        mesh, kept = clean_mesh(vertices, triangles, name=str(path), stacklevel=3)
-    except ValueError as error:
-        raise ValueError(_prefixed(path, error)) from None
-    if n is not None or spacing is not None:
-        return sample_mesh(mesh, n=n, spacing=spacing, smooth=smooth, degree=degree, seed=seed)
-    normals = None
-    if contents.normals is not None:
-        first, group = merge_equal(contents.points)
-        total = np.zeros((len(first), 3))
-        np.add.at(total, group, contents.normals)
-        try:
+        mesh, kept = clean_mesh(
+            contents.points, triangles, name=str(path), stacklevel=3, largest_part=largest_part
+        )
+        if n is not None or spacing is not None:
+            return sample_mesh(mesh, n=n, spacing=spacing, smooth=smooth, degree=degree, seed=seed)
+        if contents.normals is not None:
+            first, group = merge_equal(contents.points)
+            total = np.zeros((len(first), 3))
+            np.add.at(total, group, contents.normals)
             normals = _unit(total[group[kept]])
-        except ValueError as error:
-            raise ValueError(_prefixed(path, error)) from None
-    elif smooth:
-        normals = _fitted_normals(path, mesh, degree)
-    else:
-        normals = mesh.vertex_normals
-    boundary = None if mesh.closed else jnp.asarray(mesh.border_vertices)
-    return PointCloud(jnp.asarray(mesh.vertices), jnp.asarray(normals), boundary=boundary)
+        elif smooth:
+            normals = _fitted_normals(path, mesh, degree)
+        else:
+            normals = mesh.vertex_normals
+        boundary = None if mesh.closed else jnp.asarray(mesh.border_vertices)
+        return PointCloud(jnp.asarray(mesh.vertices), jnp.asarray(normals), boundary=boundary)
+    except ValueError as error:
+        text = str(error)
+        named = text if text.startswith(str(path)) else f"{path}: {text}"
+        raise ValueError(named) from None
 
 
 def _triangulate(contents: Contents, notes: list[str]) -> np.ndarray:
@@ -124,6 +143,7 @@ def _from_points(contents: Contents, n, spacing, degree: int) -> PointCloud:
         raise ValueError("a list of points without triangles cannot be resampled")
     points, normals = contents.points, contents.normals
     raise_at(~np.isfinite(points).all(axis=1), "point {i} is not finite: {v}", points)
+    in_range(points, "points")
     first, group = merge_equal(points)
     again = np.flatnonzero(first[group] != np.arange(len(points)))
     if again.size:
@@ -134,11 +154,20 @@ def _from_points(contents: Contents, n, spacing, degree: int) -> PointCloud:
         # Plane curves are kept in space by formats that know nothing else.
         if points.shape[1] == 3 and not points[:, 2].any() and not normals[:, 2].any():
             points, normals = points[:, :2], normals[:, :2]
-    own = {k: jnp.asarray(contents.fields[k]) for k in _OWN if k in contents.fields}
+    own = {k: _own(k, contents.fields[k]) for k in _OWN if k in contents.fields}
     x = jnp.asarray(points)
     if normals is None:
         return PointCloud(x, estimate_normals(x, degree=degree), **own)
     return PointCloud(x, jnp.asarray(normals), **own)
+
+
+def _own(name: str, value: np.ndarray) -> Array:
+    """What a cloud carries besides points and normals, as it is in a file."""
+    if name == "spacing":
+        return jnp.asarray(value, float)
+    if not np.isin(value, (0, 1)).all():
+        raise ValueError(f"field {name!r} is no mask: it holds other numbers than 0 and 1")
+    return jnp.asarray(value, bool)
 
 
 def _unit(normals: np.ndarray) -> np.ndarray:
@@ -152,7 +181,7 @@ def _fitted_normals(path, mesh: TriangleMesh, degree: int) -> np.ndarray:
     need = math.comb(degree + 2, 2) + 2
     if len(mesh.vertices) < need:
         raise ValueError(
-            f"{path}: {len(mesh.vertices)} vertices, normals of degree {degree} need at least"
+            f"{len(mesh.vertices)} vertices, normals of degree {degree} need at least"
             f" {need}: lower the degree or take smooth=False"
         )
     _, normals, used = fit_surface(
@@ -172,23 +201,20 @@ def _fitted_normals(path, mesh: TriangleMesh, degree: int) -> np.ndarray:
     return normals
 
 
-def _prefixed(path, error: Exception) -> str:
-    text = str(error)
-    return text if text.startswith(str(path)) else f"{path}: {text}"
-
-
-def read_fields(path: str | Path) -> dict[str, np.ndarray]:
-    """Values per point in a PLY, VTK or VTU file, in the order of its points.
+def read_fields(path: str | Path, *, columns: str | None = None) -> dict[str, np.ndarray]:
+    """Values per point in a PLY, VTK, VTU or XYZ file, in the order of its points.
 
     Args:
         path: file.
+        columns: of an XYZ file, as in `read`; those with other names than coordinates and
+            normals are fields.
 
     Returns:
         Arrays `(n,)`, `(n, c)`, or `(n, 3, 3)` for nine components, by name. What `read` puts
         into the cloud itself (normals, boundary, activity, spacing) is left out.
 
     Raises:
-        OSError, ValueError, ImportError: as `read`.
+        OSError, ValueError, TypeError, ImportError: as `read`.
 
     Example:
         >>> import pathlib, tempfile
@@ -198,7 +224,7 @@ def read_fields(path: str | Path) -> dict[str, np.ndarray]:
         >>> js.read_fields(path)["height"].shape
         (500,)
     """
-    fields = contents_of(path).fields
+    fields = contents_of(path, columns).fields
     return {
         name: v.reshape(-1, 3, 3) if v.shape[1:] == (9,) else v
         for name, v in fields.items()
@@ -226,7 +252,9 @@ def write(
 
     Raises:
         ValueError: unknown suffix; a field with another number of rows (both numbers given), of
-            a shape or kind that the format does not hold, or with a name that is taken.
+            a shape or kind that the format does not hold, or with a name that is taken or that
+            the format does not hold (VTU: any printable text; PLY and VTK: no blanks, ASCII).
+        TypeError: no cloud, no mapping of fields by name, or a name that is no text.
         OSError: the file cannot be written.
         ImportError: meshio is needed and absent.
 
@@ -236,14 +264,20 @@ def write(
         >>> cloud = js.sphere(500)
         >>> js.write(pathlib.Path(folder.name) / "sphere.vtu", cloud, {"x": cloud.points[:, 0]})
     """
-    path = Path(path)
+    path = Path(instance(path, (str, Path), "path"))
+    instance(cloud, PointCloud, "cloud", "js.PointCloud(points, normals) makes one")
+    given = instance({} if fields is None else fields, Mapping, "fields", "{name: values}")
     suffix = path.suffix.lower()
     if suffix not in (".vtu", ".vtk", ".ply", ".xyz"):
         raise ValueError(f"{path}: unknown suffix {path.suffix!r}; written are .vtu .vtk .ply .xyz")
+    if not is_concrete(*jax.tree.leaves((cloud, dict(given)))):
+        raise TypeError("cloud and fields must be concrete: write files outside jit and grad")
+    if not cloud.n:
+        raise ValueError("cloud has 0 points, at least 1 is needed")
     points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
     if suffix == ".xyz":
-        if fields:
-            raise ValueError(f"{path}: XYZ holds no fields ({', '.join(fields)}); take .vtu")
+        if given:
+            raise ValueError(f"{path}: XYZ holds no fields ({', '.join(given)}); take .vtu")
         names = "x y nx ny" if cloud.dim == 2 else "x y z nx ny nz"
         np.savetxt(path, np.hstack([points, normals]), fmt="%.17g", header=names)
         return
@@ -251,26 +285,46 @@ def write(
     if suffix == ".ply":
         taken += ["x", "y", "z", "nx", "ny", "nz"]
     data = {"normals": _in_space("normals", normals, cloud)}
-    for name, value in (fields or {}).items():
-        if name in taken:
-            raise ValueError(f"the name {name!r} is taken by the cloud itself")
-        data[name] = _in_space(name, np.asarray(value), cloud)
+    for name, value in given.items():
+        _check_name(name, taken, suffix)
+        data[name] = _in_space(name, value, cloud)
     for name in _OWN:
         if (value := getattr(cloud, name)) is not None:
-            data[name] = _in_space(name, np.asarray(value), cloud)
+            data[name] = _in_space(name, value, cloud)
     place = np.pad(points, ((0, 0), (0, 3 - cloud.dim)))
     library = meshio()
     if suffix == ".ply":
         mesh = library.Mesh(place, [], point_data=_columns(data))
         library.ply.write(path, mesh)
+        return
+    if suffix == ".vtu":
+        # Names go into the file as they are: here is where XML is made of them.
+        data = {escape(name, {'"': "&quot;"}): value for name, value in data.items()}
     else:
-        cells = [("vertex", np.arange(cloud.n)[:, None])]
-        mesh = library.Mesh(place, cells, point_data=data)
-        (library.vtu if suffix == ".vtu" else library.vtk).write(path, mesh)
+        for name, value in data.items():
+            if value.ndim == 2 and value.shape[1] == 2:
+                raise ValueError(f"field {name!r}: VTK holds no vectors of two numbers; take .vtu")
+    mesh = library.Mesh(place, [("vertex", np.arange(cloud.n)[:, None])], point_data=data)
+    (library.vtu if suffix == ".vtu" else library.vtk).write(path, mesh)
 
 
-def _in_space(name: str, value: np.ndarray, cloud: PointCloud) -> np.ndarray:
+def _check_name(name: object, taken: list[str], suffix: str) -> None:
+    if not isinstance(name, str):
+        raise TypeError(f"fields has the name {name!r} ({type(name).__name__}), expected text")
+    if name in taken:
+        raise ValueError(f"the name {name!r} is taken by the cloud itself")
+    if suffix != ".vtu" and name.split() != [name]:
+        raise ValueError(f"{suffix[1:].upper()} allows no blanks in names of fields: {name!r}")
+    if not (name and name.isprintable() and (suffix == ".vtu" or name.isascii())):
+        raise ValueError(f"{suffix[1:].upper()} holds no field of the name {name!r}")
+
+
+def _in_space(name: str, field: object, cloud: PointCloud) -> np.ndarray:
     """A field as `(n,)` or `(n, c)` in types that files hold, with vectors in space."""
+    try:
+        value = np.asarray(field)
+    except ValueError as error:  # ragged
+        raise TypeError(f"field {name!r} is no array of numbers: {error}") from None
     if value.ndim not in (1, 2, 3) or value.shape[0] != cloud.n:
         raise ValueError(f"field {name!r} has shape {value.shape}, expected ({cloud.n}, ...)")
     if value.ndim == 3 and value.shape[1:] != (cloud.dim, cloud.dim):
@@ -294,14 +348,20 @@ def _columns(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Scalars with names that PLY allows."""
     columns: dict[str, np.ndarray] = {}
     for name, value in data.items():
-        if name.split() != [name]:
-            raise ValueError(f"PLY allows no blanks in names of fields: {name!r}")
         if value.dtype.itemsize == 8 and value.dtype.kind in "iu":
+            most = np.iinfo(np.int32).max
+            rows = value.reshape(len(value), -1)
+            bad = np.any((rows < -most - 1) | (rows > most), axis=1)
+            text = f"field {name!r} is {{v}} at point {{i}}: PLY holds integers up to {most}"
+            raise_at(bad, text, value)
             value = value.astype(np.int32)
         if name == "normals":
-            columns.update(zip(("nx", "ny", "nz"), value.T))
+            new = dict(zip(("nx", "ny", "nz"), value.T))
         elif value.ndim == 2:
-            columns.update({f"{name}_{i}": column for i, column in enumerate(value.T)})
+            new = {f"{name}_{i}": column for i, column in enumerate(value.T)}
         else:
-            columns[name] = value
+            new = {name: value}
+        if twice := columns.keys() & new.keys():
+            raise ValueError(f"two fields would have the name {twice.pop()!r} in a PLY file")
+        columns |= new
     return columns

@@ -1,4 +1,7 @@
+"""Files: every format there and back, what is wrong with them, what they leave open."""
+
 import sys
+import tempfile
 import warnings
 from pathlib import Path
 
@@ -6,6 +9,8 @@ import jax.numpy as jnp
 import meshio
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from jaxsurf.cloud import PointCloud
 from jaxsurf.io import read, read_fields, write
@@ -291,7 +296,11 @@ POINTS_PLY = PLY.replace("element face 1\nproperty list uchar int vertex_indices
         ("a.xyz", "0 0 0\n1 0\n", "a.xyz: "),
         ("a.xyz", "0 0 0 1 1\n", "a.xyz: 5 columns; expected x y"),
         ("a.xyz", "0 0 0\n1 0 inf\n", "a.xyz: point 1 is not finite"),
-        ("a.xyz", "0 0 0 0 0 1\n1 0 0 0 0 0\n", r"a.xyz: normal 1 is \[0. 0. 0.\]"),
+        (
+            "a.xyz",
+            "# x y z nx ny nz\n0 0 0 0 0 1\n1 0 0 0 0 0\n",
+            r"a.xyz: normal 1 is \[0. 0. 0.\]",
+        ),
         ("a.xyz", "0 0 0 0 0 1\n1 0 0 0 0 1\n0 0 0 0 0 1\n", "a.xyz: points 0 and 2 coincide"),
     ],
 )
@@ -384,3 +393,231 @@ def test_real_files_as_they_are(name, n):
     if "bunny" in name:
         assert "1113 vertices belong to no triangle" in text and cloud.boundary.sum() == 223
     assert Path(name).stem in text
+
+
+# --- what a file leaves open ---------------------------------------------------------------
+
+
+def curve(n=30):
+    angle = 2 * np.pi * np.arange(n) / n
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def write_columns(path, *columns, header=""):
+    np.savetxt(path, np.column_stack(columns), header=header)
+    return path
+
+
+def test_a_value_in_the_fourth_column_is_not_taken_for_a_normal(tmp_path):
+    x = np.asarray(ellipsoid(300).points)
+    path = write_columns(tmp_path / "a.xyz", x, x[:, 2])
+    with pytest.raises(ValueError, match=r"row 0 has length .*columns='x y z value' or columns='x"):
+        read(path)
+    cloud = read(path, columns="x y z height", degree=2)
+    assert cloud.dim == 3 and (np.asarray(cloud.points) == x).all()
+    assert (read_fields(path, columns="x y z height")["height"] == x[:, 2]).all()
+    named = write_columns(tmp_path / "b.xyz", x, x[:, 2], header="x y z height")
+    assert read(named, degree=2).dim == 3 and set(read_fields(named)) == {"height"}
+    flat = read(write_columns(tmp_path / "c.xyz", curve(), curve()))
+    assert flat.dim == 2 and np.allclose(flat.normals, curve())
+    long = write_columns(tmp_path / "d.xyz", curve(), 3 * curve())
+    assert np.allclose(read(long, columns="x y nx ny").normals, curve())
+
+
+@pytest.mark.parametrize("most", [1.0, 255.0])
+def test_colours_are_not_taken_for_normals(tmp_path, most):
+    cloud = ellipsoid(300)
+    colour = np.random.default_rng(0).integers(0, 256, (300, 3)) * (most / 255)
+    path = write_columns(tmp_path / "a.xyz", cloud.points, colour)
+    with pytest.raises(ValueError, match=r"no unit normals: row \d.*columns='x y z r g b'"):
+        read(path)
+    back = read(path, columns="x y z r g b", degree=2)
+    assert np.abs(np.asarray(back.normals) - cloud.normals).max() < 0.05
+    found = read_fields(path, columns="x y z r g b")
+    assert (np.stack([found[c] for c in "rgb"], axis=1) == colour).all()
+
+
+MARK = "\ufeff"
+
+
+@pytest.mark.parametrize("suffix", ["obj", "off", "xyz", "ply", "stl", "vtk", "vtu"])
+@pytest.mark.filterwarnings("ignore")
+def test_a_mark_of_utf8_at_the_start_is_passed_over(tmp_path, suffix):
+    ball, path = ball_mesh(60), tmp_path / f"a.{suffix}"
+    if suffix == "obj":
+        write_obj(path, ball.vertices, ball.triangles.tolist())
+    elif suffix == "xyz":
+        write(path, ellipsoid(60))
+    else:
+        cells = [("triangle", ball.triangles.astype(np.int32))]
+        options = {"binary": False} if suffix in ("ply", "stl") else {}
+        kind = "off" if suffix == "off" else None
+        meshio.write(path, meshio.Mesh(ball.vertices, cells), kind, **options)
+    plain = np.asarray(read(path).points)
+    path.write_bytes(MARK.encode() + path.read_bytes())
+    assert (np.asarray(read(path).points) == plain).all()
+
+
+ODD = ["a<&\"b'>", "  two  blanks ", "Größe α²", "x", "&amp;", "]]>", "nx"]
+
+
+def test_odd_names_of_fields_come_back(tmp_path):
+    cloud = ellipsoid(20)
+    fields = {name: np.arange(20.0) + i for i, name in enumerate(ODD)}
+    write(tmp_path / "a.vtu", cloud, fields)
+    found = read_fields(tmp_path / "a.vtu")
+    assert found.keys() == fields.keys()
+    assert all((found[name] == fields[name]).all() for name in fields)
+    for suffix in ("ply", "vtk"):
+        plain = {name: fields[name] for name in ("a<&\"b'>", "&amp;", "]]>")}
+        write(tmp_path / f"a.{suffix}", cloud, plain)
+        found = read_fields(tmp_path / f"a.{suffix}")
+        assert all((found[name] == plain[name]).all() for name in plain)
+        with pytest.raises(ValueError, match="holds no field of the name 'Größe'"):
+            write(tmp_path / f"b.{suffix}", cloud, {"Größe": np.arange(20.0)})
+
+
+def test_unsigned_bytes_of_a_binary_ply(tmp_path):
+    rows = np.zeros(4, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1")])
+    rows["x"], rows["red"] = np.arange(4), [0, 127, 128, 255]
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 4\n" + "".join(
+        f"property {kind} {name}\n"
+        for kind, name in (("float", "x"), ("float", "y"), ("float", "z"), ("uchar", "red"))
+    )
+    path = tmp_path / "a.ply"
+    path.write_bytes(header.encode() + b"end_header\n" + rows.tobytes())
+    assert read_fields(path)["red"].tolist() == [0, 127, 128, 255]
+
+
+@pytest.mark.parametrize("suffix", ["vtu", "vtk", "ply"])
+def test_what_a_format_does_not_hold_is_refused(tmp_path, suffix):
+    path, cloud = tmp_path / f"a.{suffix}", ellipsoid(20)
+    bad = [({"": np.zeros(20)}, ValueError), ({3: np.zeros(20)}, TypeError)]
+    bad += [(np.zeros(20), TypeError), ([("u", np.zeros(20))], TypeError)]
+    if suffix == "vtk":
+        bad += [({"u": np.zeros((20, 2))}, ValueError)]
+    if suffix == "ply":
+        bad += [({"u": np.zeros((20, 2)), "u_1": np.zeros(20)}, ValueError)]
+        bad += [({"u": np.arange(20) + 2**31}, ValueError)]
+    for fields, error in bad:
+        with pytest.raises(error):
+            write(path, cloud, fields)
+        assert not path.exists()
+
+
+def test_a_way_on_for_edges_of_many_triangles(tmp_path):
+    ball = ball_mesh(300)
+    a, b = ball.triangles[0, :2]
+    fin = np.concatenate([ball.triangles, [[a, b, 300]]])
+    vertices = np.concatenate([ball.vertices, [1.5 * ball.vertices[a]]])
+    path = write_obj(tmp_path / "fin.obj", vertices, fin.tolist())
+    with pytest.raises(ValueError, match=r"largest_part=True of clean_mesh and read .*faces=False"):
+        read(path)
+    with pytest.warns(UserWarning, match="1 triangles dropped, so that no edge has more than two"):
+        cloud = read(path, largest_part=True)
+    assert cloud.n == 300 and cloud.boundary is None
+    points = read(write_obj(tmp_path / "b.obj", ball.vertices, fin[:-1].tolist()), faces=False)
+    assert points.n == 300 and points.boundary is None
+
+
+# --- any file ------------------------------------------------------------------------------
+
+FEW = settings(max_examples=25, derandomize=True, deadline=None, database=None)
+KINDS = ["float64", "float32", "int64", "int32", "uint8", "bool"]
+
+
+@st.composite
+def clouds_and_fields(draw):
+    dim, n = draw(st.sampled_from([2, 3])), draw(st.integers(1, 40))
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    points = draw(st.sampled_from([1e-9, 1.0, 1e6])) * rng.normal(size=(n, dim))
+    normals = rng.normal(size=(n, dim))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    mask = rng.random(n) < 0.5 if draw(st.booleans()) else None
+    cloud = PointCloud(points, normals, boundary=mask)
+    names = st.text(min_size=1, max_size=8).filter(lambda s: s not in ("normals", "spacing"))
+    fields = {}
+    for name in draw(st.lists(names, max_size=3, unique=True)):
+        shape = draw(st.sampled_from([(), (3,), (4,), (dim, dim)]))
+        fields[name] = (100 * rng.random((n, *shape))).astype(draw(st.sampled_from(KINDS)))
+    return cloud, fields
+
+
+@FEW
+@given(clouds_and_fields(), st.sampled_from([".vtu", ".vtk", ".ply"]))
+def test_what_is_written_is_read_or_refused(given, suffix):
+    """Every cloud with any fields of any names comes back as it was, or is not written."""
+    cloud, fields = given
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"a{suffix}"
+        try:
+            write(path, cloud, fields)
+        except ValueError as error:
+            assert fields and ("name" in str(error) or "blanks" in str(error)), error
+            return
+        back, found = quietly(path), read_fields(path)
+    assert (back.points == cloud.points).all()
+    assert np.allclose(back.normals, cloud.normals, atol=1e-15)
+    assert (back.boundary is None) == (cloud.boundary is None)
+    assert back.boundary is None or (back.boundary == cloud.boundary).all()
+    for name, value in fields.items():
+        lack = 3 - cloud.dim if value.shape[1:] in ((2,), (2, 2)) else 0
+        value = np.pad(value, [(0, 0)] + [(0, lack)] * (value.ndim - 1))
+        if suffix == ".ply" and value.ndim > 1:
+            flat = value.reshape(cloud.n, -1)
+            same = [np.array_equal(found[f"{name}_{i}"], c) for i, c in enumerate(flat.T)]
+            assert all(same)
+        else:
+            assert np.array_equal(found[name], value)
+
+
+class Files(dict):
+    def __repr__(self):  # of a failing example
+        return "files"
+
+
+@pytest.fixture(scope="module")
+def whole_files(tmp_path_factory):
+    """Bytes of a small file of every kind."""
+    folder, ball = tmp_path_factory.mktemp("whole"), ball_mesh(40)
+    files = Files()
+    for kind in ("obj", "off", "ply", "stl", "vtk", "vtu"):
+        path = folder / f"mesh.{kind}"
+        if kind == "obj":
+            write_obj(path, ball.vertices, ball.triangles.tolist())
+        else:
+            cells = [("triangle", ball.triangles.astype(np.int32))]
+            options = {"binary": True} if kind == "stl" else {}
+            meshio.write(path, meshio.Mesh(ball.vertices, cells), **options)
+        files[path.name] = path.read_bytes()
+    for kind in ("xyz", "ply", "vtk", "vtu"):
+        path, cloud = folder / f"cloud.{kind}", ellipsoid(40)
+        write(path, cloud, None if kind == "xyz" else {"u": cloud.points, "v": jnp.arange(40)})
+        files[path.name] = path.read_bytes()
+    return files
+
+
+@settings(FEW, max_examples=200)
+@given(st.data())
+@pytest.mark.filterwarnings("ignore")
+def test_damaged_files_are_errors_or_files(whole_files, data):
+    """Any byte changed, or any part lost: a ValueError, or what the file then says."""
+    name = data.draw(st.sampled_from(sorted(whole_files)))
+    content = bytearray(whole_files[name])
+    for _ in range(data.draw(st.integers(0, 3))):
+        # Half of them in the header, where numbers and names are.
+        end = data.draw(st.sampled_from([min(400, len(content)), len(content)]))
+        content[data.draw(st.integers(0, end - 1))] = data.draw(st.integers(0, 255))
+    if data.draw(st.booleans()):
+        content = content[: data.draw(st.integers(0, len(content)))]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        path.write_bytes(bytes(content))
+        for reader in (lambda: read(path, smooth=False, degree=1), lambda: read_fields(path)):
+            try:
+                found = reader()
+            except ValueError as error:
+                assert str(error).startswith(str(path))
+            else:
+                if isinstance(found, PointCloud):
+                    assert np.isfinite(found.points).all()

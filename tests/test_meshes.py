@@ -314,7 +314,7 @@ def test_bad_requests():
         sample_mesh(mesh)
     with pytest.raises(ValueError, match=r"not n = 100 and spacing = 0\.1"):
         sample_mesh(mesh, n=100, spacing=0.1)
-    with pytest.raises(ValueError, match=r"spacing is -0.1, expected a positive number"):
+    with pytest.raises(ValueError, match=r"spacing = -0.1, expected above 0"):
         sample_mesh(mesh, spacing=-0.1)
     with pytest.raises(ValueError, match=r"n = 3 points .* expected at least 10"):
         sample_mesh(mesh, n=3)

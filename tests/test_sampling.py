@@ -88,7 +88,7 @@ def test_poisson_disk_is_apart_and_maximal():
     assert distance[:, 0].max() < radius  # no candidate could be added
     np.testing.assert_array_equal(kept, poisson_disk(candidates, radius, seed=3))
     assert not np.array_equal(kept, poisson_disk(candidates, radius, seed=4))
-    with pytest.raises(ValueError, match="radius is 0"):
+    with pytest.raises(ValueError, match="radius = 0, expected above 0"):
         poisson_disk(candidates, 0)
 
 
@@ -175,7 +175,7 @@ def test_relax_names_a_point_that_cannot_be_projected():
     points[4] = 0
     with np.errstate(invalid="ignore"), pytest.raises(ValueError, match="failed for point 4"):
         relax(points, sphere_projection(), spacing=0.5)
-    with pytest.raises(ValueError, match="spacing is 0"):
+    with pytest.raises(ValueError, match="spacing = 0, expected above 0"):
         relax(random_sphere(20), sphere_projection(), spacing=0)
 
 

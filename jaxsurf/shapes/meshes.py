@@ -14,11 +14,11 @@ from numpy import ndarray as Array
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from jaxsurf.arguments import raise_at
+from jaxsurf.arguments import in_range, instance, on_host, raise_at, real, whole
 from jaxsurf.cloud import PointCloud
 from jaxsurf.shapes.closest import ClosestPoint, fit_surface
 from jaxsurf.shapes.order import sort_cloud
-from jaxsurf.shapes.sampling import ideal_spacing, quasi_uniform
+from jaxsurf.shapes.sampling import MOST, ideal_spacing, points_at, quasi_uniform
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +48,8 @@ class TriangleMesh:
     triangles: Int[Array, "m 3"]
 
     def __post_init__(self):
-        object.__setattr__(self, "vertices", np.asarray(self.vertices, float))
-        object.__setattr__(self, "triangles", np.asarray(self.triangles, np.int64))
+        object.__setattr__(self, "vertices", on_host(self.vertices, "vertices"))
+        object.__setattr__(self, "triangles", _vertex_numbers(self.triangles))
         _check_arrays(self.vertices, self.triangles)
         t = self.triangles
         twice = (t[:, 0] == t[:, 1]) | (t[:, 1] == t[:, 2]) | (t[:, 2] == t[:, 0])
@@ -62,6 +62,13 @@ class TriangleMesh:
                 f"triangles {a} and {b} have opposite orientation across their common edge"
                 f" ({turned.size} such edges); clean_mesh turns them round"
             )
+
+    def __repr__(self) -> str:
+        kind = "closed" if self.closed else f"{len(self.border_loops)} borders"
+        return (
+            f"TriangleMesh({len(self.vertices)} vertices, {len(self.triangles)} triangles, {kind},"
+            f" genus {self.genus}, edges of {self.edge_length:.3g})"
+        )
 
     @cached_property
     def edge_table(self) -> EdgeTable:
@@ -214,6 +221,7 @@ def clean_mesh(
     *,
     name: str = "mesh",
     stacklevel: int = 2,
+    largest_part: bool = False,
 ) -> tuple[TriangleMesh, Int[Array, " kept"]]:
     """Mesh from raw arrays, every repair stated in a warning.
 
@@ -226,15 +234,24 @@ def clean_mesh(
         triangles: vertex numbers from 0, `(m, 3)`.
         name: what to call the mesh in warnings and errors.
         stacklevel: of the warnings, as in `warnings.warn`.
+        largest_part: where edges have more than two triangles, as where a fin stands on a
+            surface, cut the triangles apart there and keep the pieces, from the one with the
+            largest area on, that leave no edge with more than two; the others are dropped.
 
     Returns:
         The mesh, and for each of its vertices the row of `vertices` that it was.
 
     Raises:
         ValueError: as `TriangleMesh`; no triangle left; not orientable (a Möbius band).
+        TypeError: arrays of other kinds.
+
+    Example:
+        >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+        >>> mesh, kept = js.clean_mesh(corners, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+        >>> mesh.closed, kept.tolist()
+        (True, [0, 1, 2, 3])
     """
-    vertices = np.asarray(vertices, float)
-    triangles = np.asarray(triangles, np.int64)
+    vertices, triangles = on_host(vertices, "vertices"), _vertex_numbers(triangles)
     try:
         _check_arrays(vertices, triangles)
         first, inverse = merge_equal(vertices)
@@ -245,6 +262,10 @@ def clean_mesh(
         triangles = triangles[~collapsed]
         if not len(triangles):
             raise ValueError("no triangles")
+        chosen = np.ones(len(triangles), bool)
+        if largest_part:
+            chosen = _largest_part(vertices, triangles)
+            triangles = triangles[chosen]
         used, triangles = np.unique(triangles, return_inverse=True)
         triangles = triangles.reshape(-1, 3)
         unused = np.setdiff1d(np.arange(len(first)), used)
@@ -260,6 +281,7 @@ def clean_mesh(
         (collapsed.sum(), "{} triangles without area (a vertex named twice) dropped"),
         (unused.size, f"{{}} vertices belong to no triangle, dropped (first: {first[unused[:1]]})"),
         (flip.sum(), "{} triangles turned round to agree with their neighbours"),
+        ((~chosen).sum(), "{} triangles dropped, so that no edge has more than two"),
     ):
         if count:
             warnings.warn(f"{name}: " + text.format(count), stacklevel=stacklevel)
@@ -285,7 +307,7 @@ def sample_mesh(
     Args:
         mesh: the surface, closed or with borders.
         n: number of points.
-        spacing: distance h between neighbours, instead of n: $n = 	ext{area} / h^2$.
+        spacing: distance h between neighbours, instead of n: $n = \text{area} / h^2$.
         smooth: fit polynomials; if False, the points stay on the triangles with normals
             carried over from the vertices: right for surfaces with sharp edges.
         degree: of the polynomials.
@@ -307,6 +329,10 @@ def sample_mesh(
         >>> cloud.n, bool(jnp.all(cloud.normals == jnp.array([0.0, 0.0, 1.0])))
         (200, True)
     """
+    instance(mesh, TriangleMesh, "mesh", "js.clean_mesh(vertices, triangles) makes one")
+    whole(degree, "degree", least=1)
+    whole(seed, "seed", least=0)
+    instance(smooth, (bool, np.bool_), "smooth")
     n, h = _how_many(mesh.area, n, spacing)
     need = math.comb(degree + 2, 2) + 2
     if smooth and len(mesh.vertices) < need:
@@ -355,12 +381,9 @@ def sample_mesh(
 def _how_many(area: float, n: int | None, spacing: float | None) -> tuple[int, float]:
     if (n is None) == (spacing is None):
         raise ValueError(f"give one of n and spacing, not n = {n} and spacing = {spacing}")
-    if spacing is not None:
-        if not spacing > 0:
-            raise ValueError(f"spacing is {spacing}, expected a positive number")
-        n = round(area / spacing**2)
-    assert n is not None
-    if n < 10:
+    if n is None:
+        n = points_at(real(spacing, "spacing", above=0), area)
+    if whole(n, "n", most=MOST) < 10:
         raise ValueError(f"n = {n} points on a surface of area {area:.3g}, expected at least 10")
     return n, ideal_spacing(area, n)
 
@@ -398,12 +421,20 @@ def _border_points(mesh: TriangleMesh, spacing: float) -> Float[Array, "b 3"]:
     return np.concatenate(found)
 
 
+def _vertex_numbers(triangles) -> Int[Array, "m 3"]:
+    numbers = on_host(triangles, "triangles")
+    if not (np.isfinite(numbers) & (numbers == np.rint(numbers))).all():
+        raise ValueError("triangles must hold whole numbers of vertices")
+    return numbers.astype(np.int64)
+
+
 def _check_arrays(vertices, triangles):
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise ValueError(f"vertices must have shape (n, 3), not {vertices.shape}")
     if triangles.ndim != 2 or triangles.shape[1] != 3:
         raise ValueError(f"triangles must have shape (m, 3), not {triangles.shape}")
     raise_at(~np.isfinite(vertices).all(axis=1), "vertex {i} is not finite: {v}", vertices)
+    in_range(vertices, "vertices")
     outside = ((triangles < 0) | (triangles >= len(vertices))).any(axis=1)
     text = f"triangle {{i}} names the vertices {{v}} (from 0), but there are {len(vertices)}"
     raise_at(outside, text, triangles)
@@ -415,8 +446,36 @@ def _check_manifold(table: EdgeTable):
         i, j = table.ends[many[0]]
         raise ValueError(
             f"{many.size} edges are shared by more than two triangles (first: vertices {i} and"
-            f" {j}, {table.count[many[0]]} triangles)"
+            f" {j}, {table.count[many[0]]} triangles); largest_part=True of clean_mesh and read"
+            " drops what stands on the largest part, faces=False of read takes the points alone"
         )
+
+
+def _largest_part(vertices, triangles) -> Bool[Array, " m"]:
+    """Which triangles stay, so that no edge has more than two."""
+    table = EdgeTable.of(triangles, len(vertices))
+    if table.count.max() <= 2:
+        return np.ones(len(triangles), bool)
+    inner = table.faces[table.count == 2]
+    label = csgraph.connected_components(_graph(inner, len(triangles)), directed=False)[1]
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    area = np.bincount(label, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+    # Which piece has how many triangles at which of the edges that too many share.
+    ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1), axis=-1)
+    key = ends[..., 0] * len(vertices) + ends[..., 1]
+    wide = table.ends[table.count > 2] @ [len(vertices), 1]
+    at, edge = np.nonzero(np.isin(key, wide))
+    held = sparse.coo_array(
+        (np.ones(len(at)), (label[at], np.searchsorted(wide, key[at, edge]))),
+        shape=(len(area), len(wide)),
+    ).tocsr()
+    load, kept = np.zeros(len(wide)), np.zeros(len(area), bool)
+    # Areas that are equal up to round-off in the order of the file.
+    for piece in np.argsort(-(area / area.max()).round(9), kind="stable"):
+        more = held[[piece]].toarray()[0]
+        if (load + more <= 2).all():
+            load, kept[piece] = load + more, True
+    return kept[label]
 
 
 def merge_equal(points: Float[Array, "n d"]) -> tuple[Int[Array, " u"], Int[Array, " n"]]:

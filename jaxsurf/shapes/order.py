@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsurf.arguments import is_concrete, raise_at
+from jaxsurf.arguments import instance, is_concrete, on_host, raise_at
 from jaxsurf.cloud import PointCloud
 
 # 16 bits an axis tell 65,536 steps along the longest side apart: finer than any surface cloud
@@ -37,7 +37,7 @@ def sort_points(points) -> np.ndarray:
     """
     if not is_concrete(points):
         raise ValueError("sorting needs concrete points: sort before entering jit or grad")
-    points = np.asarray(points, float)
+    points = on_host(points, "points")
     if points.ndim != 2 or points.shape[1] not in (2, 3):
         raise ValueError(f"points must have shape (n, 2) or (n, 3), not {points.shape}")
     raise_at(~np.isfinite(points).all(axis=1), "point {i} is not finite: {v}", points)
@@ -75,6 +75,7 @@ def sort_cloud(cloud: PointCloud) -> tuple[PointCloud, np.ndarray]:
         >>> field[order][np.argsort(order)].tolist()
         [10.0, 20.0, 30.0]
     """
+    instance(cloud, PointCloud, "cloud", "js.PointCloud(points, normals) makes one")
     if not is_concrete(cloud.points, cloud.active):
         raise ValueError("sorting needs a concrete cloud: sort before entering jit or grad")
     on = cloud.host_active

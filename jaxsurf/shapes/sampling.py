@@ -17,11 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
-from jaxsurf.arguments import raise_at
+from jaxsurf.arguments import in_range, instance, on_host, raise_at, real, whole
 from jaxsurf.cloud import PointCloud
 
 Project = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
+# Points are numbered in 32 bits.
+MOST = 2**31 - 1
 # A maximal Poisson-disk subset of about six random candidates a point, no two closer than this
 # fraction of h, has about one point per h^(d-1).
 _DISK = 0.70
@@ -51,6 +53,23 @@ def ideal_spacing(measure: float, n: int, *, dim: int = 3) -> float:
     return float((measure / n) ** (1 / (dim - 1)))
 
 
+def points_at(spacing: float, measure: float, *, dim: int = 3) -> int:
+    """How many points h apart a surface of that area holds.
+
+    Raises:
+        ValueError: more than can be numbered.
+
+    Example:
+        >>> points_at(0.1, 4 * np.pi)
+        1257
+    """
+    with np.errstate(over="ignore", divide="ignore"):
+        n = float(np.divide(measure, float(spacing) ** (dim - 1)))
+    if not n <= MOST:
+        raise ValueError(f"spacing = {spacing} gives n = {n:.3g} points, at most {MOST} fit")
+    return round(n)
+
+
 def poisson_disk(
     candidates: np.ndarray, radius: float, *, normals: np.ndarray | None = None, seed: int = 0
 ) -> np.ndarray:
@@ -66,7 +85,9 @@ def poisson_disk(
         Sorted indices of the candidates that are kept.
 
     Raises:
-        ValueError: the radius is not positive.
+        ValueError: the radius is not positive, candidates that are not finite (named by index),
+            or shapes that do not belong together.
+        TypeError: arrays or numbers of other kinds.
 
     Example:
         >>> points = np.random.default_rng(0).random((500, 2))
@@ -75,9 +96,11 @@ def poisson_disk(
         >>> bool(gaps.min() >= 0.1)
         True
     """
-    candidates = np.asarray(candidates, float)
-    if not radius > 0:
-        raise ValueError(f"radius is {radius}, expected a positive number")
+    candidates = _points(candidates, "candidates")
+    real(radius, "radius", above=0)
+    whole(seed, "seed", least=0)
+    if normals is not None:
+        normals = _like(normals, candidates, "normals")
     rank = np.random.default_rng(seed).permutation(len(candidates))
     pairs = cKDTree(candidates).query_pairs(radius, output_type="ndarray")
     if normals is not None:
@@ -123,9 +146,9 @@ def thin(
         >>> thin(np.random.default_rng(0).random((600, 2)), 100).shape
         (100,)
     """
-    candidates = np.asarray(candidates, float)
+    candidates = _points(candidates, "candidates")
     m, dim = candidates.shape
-    if not 0 < n <= m:
+    if not 0 < whole(n, "n") <= m:
         raise ValueError(f"cannot choose n = {n} of {m} candidates")
     if n == m:
         return np.arange(m)
@@ -180,9 +203,9 @@ def relax(
         >>> measure_quality(points, measure=4 * np.pi).smallest > 0.7
         True
     """
-    if not spacing > 0:
-        raise ValueError(f"spacing is {spacing}, expected a positive number")
-    points, normals = _projected(np.array(points, float), project)
+    real(spacing, "spacing", above=0)
+    whole(steps, "steps", least=0)
+    points, normals = _projected(_points(points, "points"), project)
     free = np.ones(len(points), bool) if fixed is None else ~np.asarray(fixed)
     if len(points) < 2 or not free.any():
         return points, normals
@@ -300,6 +323,11 @@ def jitter(
     Returns:
         A cloud in the same order, with the normals that `project` gives.
 
+    Raises:
+        ValueError: `spacing` not positive, `fraction` negative, or a point that `project` cannot
+            put on the surface (named).
+        TypeError: no cloud, or `project` is no function that returns points and normals.
+
     Example:
         >>> cloud = js.sphere(1_000)
         >>> h = ideal_spacing(4 * np.pi, 1_000)
@@ -307,8 +335,12 @@ def jitter(
         >>> bool(jnp.linalg.norm(moved.points - cloud.points, axis=1).max() <= 0.26 * h)
         True
     """
-    points = np.array(cloud.points, float)
-    normals = np.array(cloud.normals, float)
+    instance(cloud, PointCloud, "cloud", "js.PointCloud(points, normals) makes one")
+    real(spacing, "spacing", above=0)
+    real(fraction, "fraction", least=0)
+    whole(seed, "seed", least=0)
+    points = on_host(cloud.points, "cloud.points")
+    normals = on_host(cloud.normals, "cloud.normals")
     stays = np.zeros(cloud.n, bool)
     if cloud.boundary is not None:
         stays |= np.asarray(cloud.boundary)
@@ -363,8 +395,29 @@ def _same_sheet(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.sum(a * b, axis=-1) > 0
 
 
+def _points(values, name: str) -> np.ndarray:
+    points = on_host(values, name)
+    if points.ndim != 2 or points.shape[1] not in (2, 3):
+        raise ValueError(f"{name} must have shape (m, 2) or (m, 3), not {points.shape}")
+    raise_at(~np.isfinite(points).all(axis=1), f"{name}: point {{i}} is not finite: {{v}}", points)
+    return in_range(points, name)
+
+
+def _like(values, points: np.ndarray, name: str) -> np.ndarray:
+    array = on_host(values, name)
+    if array.shape != points.shape:
+        raise ValueError(f"{name} have shape {array.shape}, expected {points.shape}")
+    return array
+
+
 def _projected(points: np.ndarray, project: Project) -> tuple[np.ndarray, np.ndarray]:
-    onto, normals = (np.array(a, float) for a in project(points))
+    if not callable(project):
+        raise TypeError(f"project is a {type(project).__name__}, expected a function")
+    result = project(points)
+    if not (isinstance(result, tuple) and len(result) == 2):
+        raise TypeError("project must return a pair: points and unit normals")
+    onto = _like(result[0], points, "the points that project returns")
+    normals = _like(result[1], points, "the normals that project returns")
     finite = np.isfinite(onto).all(axis=1) & np.isfinite(normals).all(axis=1)
     raise_at(~finite, "projection failed for point {i} at {v}", points)
     return onto, normals

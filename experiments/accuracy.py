@@ -12,8 +12,6 @@ from jaxsurf.frames import estimate_normals
 from . import surfaces
 from .report import Method, Row, method_name, relative_l2
 
-TITLE = "Study: error of the Laplacian on the unit sphere, with defaults, beside other codes"
-
 # What others reach at n = 1e5, on Fibonacci points and on jittered ones.
 _PEERS = {
     js.GFDM(degree=2): ("GFDM degree 2 written by hand", {"regular": 1.7e-4, "jittered": 7.3e-4}),

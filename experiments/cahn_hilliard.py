@@ -25,8 +25,6 @@ import jaxsurf as js
 
 from .report import Row, method_name
 
-TITLE = "Cahn-Hilliard on a torus: mass, energy, growth of a mode against linear theory"
-
 _R, _r = 1.0, 0.45
 _MEAN = 0.1
 _METHOD = js.DCPSE(order=2)

@@ -13,8 +13,6 @@ import jaxsurf as js
 from .pictures import convergence
 from .report import Row, slope
 
-TITLE = "Laplace-Beltrami of sin + cos on the unit circle, order 2 (paper 001, Fig. 2c)"
-
 
 def paper_laplacian(n: int) -> tuple[js.PointCloud, js.Stencil]:
     """Equispaced points, and the Laplacian with the paper's parameters."""

@@ -32,8 +32,6 @@ from .cutoff import smooth_support
 from .pictures import convergence
 from .report import Row, slope
 
-TITLE = "Laplace-Beltrami of Y40 on the unit sphere, orders 2 and 4 (paper 001, Fig. 3c)"
-
 # Maximum error of a first prototype at N = 16,000.
 _PROTOTYPE = {2: 5.7e-2, 4: 3.8e-5}
 

@@ -27,8 +27,6 @@ from .e02_sphere_laplacian import harmonic
 from .pictures import convergence
 from .report import Row
 
-TITLE = "cost and accuracy beside the closest-point method (paper 001, Fig. 3b, 3c)"
-
 
 def seconds(call: Callable, repeats: int = 5) -> float:
     """Median, after one call that does not count."""

@@ -17,8 +17,6 @@ from .e01_circle_laplacian import paper_laplacian
 from .pictures import convergence
 from .report import Row, slope
 
-TITLE = "Poisson on the unit circle, pinned at (1, 0), order 2 (paper 001, Fig. 2d)"
-
 
 def run(quick: bool, out: Path) -> list[Row]:
     sizes = [50, 100, 200, 400] if quick else [50, 100, 200, 400, 800, 1600]

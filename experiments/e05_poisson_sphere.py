@@ -19,10 +19,6 @@ from .e02_sphere_laplacian import harmonic, paper_laplacian
 from .pictures import convergence
 from .report import Row, slope
 
-TITLE = (
-    "Poisson on the unit sphere, Y40 given on a great circle, orders 2 and 4 (paper 001, Fig. 3d)"
-)
-
 
 def solution_error(n: int, order: int, *, proportional: bool = False) -> tuple[np.ndarray, int]:
     """Error at every point, and the number of Krylov steps."""

@@ -31,8 +31,6 @@ from .cutoff import smooth_support
 from .pictures import convergence
 from .report import Row, slope
 
-TITLE = "Mean and Gauss curvature of the ellipsoid (1, 0.8, 0.75), order 2 (paper 001, Fig. 4a-c)"
-
 _AXES = np.array([1.0, 0.8, 0.75])
 
 

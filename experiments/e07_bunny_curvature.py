@@ -21,8 +21,6 @@ from jaxsurf.plot import plot_cloud
 from . import data
 from .report import Row
 
-TITLE = "Mean curvature of the Stanford bunny, full and on 2,960 points (paper 001, Fig. 4d)"
-
 _SOURCE = "paper 001, Fig. 4d (a picture)"
 
 

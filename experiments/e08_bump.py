@@ -31,8 +31,6 @@ from . import bump_reference as bump
 from .cutoff import smooth_support
 from .report import Row, method_name
 
-TITLE = "Diffusion over a bump against fine surface finite elements (paper 001, Figs. 5, 6)"
-
 _SPACING = 1 / 32
 _POINTS = 18_439
 _END = 1.0

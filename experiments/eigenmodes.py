@@ -21,8 +21,6 @@ from jaxsurf.plot import plot_cloud
 
 from .report import Method, Row, method_name
 
-TITLE = "Study: eigenvalues on sphere, ellipsoid and torus against spectral references"
-
 _COUNT = 24
 _AXES = (1.0, 0.8, 0.75)
 _RADII = (3.0, 1.0)

@@ -25,8 +25,6 @@ import jaxsurf as js
 from . import data
 from .report import Row, relative_l2, slope
 
-TITLE = "Distances by the heat method: the sphere against great circles, bands on the bunny"
-
 _PEER = 1.4e-2
 _BOUND = 1e-2
 _N = 10_000

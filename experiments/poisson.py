@@ -13,8 +13,6 @@ from . import data, surfaces
 from .pictures import convergence
 from .report import Method, Row, method_name, relative_l2, slope
 
-TITLE = "Study: Poisson on ellipsoid, torus and a surface of genus 2; scans; orders and steps"
-
 _METHODS: dict[Method, int] = {
     js.DCPSE(order=2): 2,
     js.DCPSE(order=4): 4,

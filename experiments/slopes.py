@@ -12,8 +12,6 @@ from . import surfaces
 from .pictures import convergence
 from .report import Method, Row, method_name, relative_l2, slope
 
-TITLE = "Study: observed orders of the Laplacian on sphere, ellipsoid and torus"
-
 _KINDS = ("regular", "jittered", "Poisson disk")
 # The order of convergence that each method promises.
 _METHODS: dict[Method, int] = {js.DCPSE(order=r): r for r in (2, 3, 4)} | {

@@ -16,8 +16,6 @@ import jaxsurf as js
 from . import data, surfaces
 from .report import Method, Row, method_name
 
-TITLE = "Study: spectra of the default Laplacians, also on random points and the bunny"
-
 _METHODS: list[Method] = [
     js.DCPSE(order=2),
     js.DCPSE(order=4),

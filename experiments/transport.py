@@ -23,8 +23,6 @@ import jaxsurf as js
 
 from .report import Row, method_name, relative_l2, slope
 
-TITLE = "Transport: solid-body rotation on the sphere, order after one turn, growth in 100"
-
 _AXIS = np.array([0.36, 0.48, 0.8])
 _CENTRE = np.array([0.8, -0.6, 0.0])
 _TURN = 2 * np.pi

@@ -31,8 +31,6 @@ import jaxsurf as js
 from . import data
 from .report import Row, method_name, slope
 
-TITLE = "Turing patterns: growth rates on the sphere against theory, a pattern on the bunny"
-
 _A, _B, _RATIO = 0.1, 0.9, 10.0
 _REST = np.array([_A + _B, _B / (_A + _B) ** 2])
 _SOURCE = "linear stability"

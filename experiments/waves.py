@@ -27,8 +27,6 @@ import jaxsurf as js
 from . import data
 from .report import Row, method_name, relative_l2, slope
 
-TITLE = "Waves: a standing wave on the sphere against the exact one, a drop on the Armadillo"
-
 _DEGREE = 5
 # Tsitouras' method is stable on a half disk of more than this radius on the left.
 _REACH = 2.0

@@ -13,7 +13,7 @@ from .arguments import is_concrete
 from .cloud import PointCloud
 
 Value = float | Float[Array, "*m"] | Callable[[Float[Array, ""]], Float[Array, "*m"]]
-Where = Bool[Array, " n"] | Int[Array, " m"]
+Where = Bool[Array, " n"] | Int[Array, " m"] | Sequence[int]
 
 
 class Condition(eqx.Module):

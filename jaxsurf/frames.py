@@ -25,7 +25,7 @@ _LOOSE = 0.01
 _CHUNK = 4096
 
 
-def tangent_frames(normals: Float[Array, "n d"]) -> Float[Array, "n d d"]:
+def tangent_frames(normals: Float[Array, "*n d"]) -> Float[Array, "*n d d"]:
     r"""Right-handed orthonormal frames whose last row is the normal.
 
     In space $t_1, t_2$ come from rotating the z axis (for $n_z<0$ the −z axis) onto n by the

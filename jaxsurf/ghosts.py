@@ -352,8 +352,8 @@ def _values(cloud, images, conditions, owned, place, throw):
 
     indices = jnp.asarray(np.concatenate([np.full(first, free), depends]).astype(np.int32))
     weights = jnp.concatenate([jnp.zeros(first, dtype), total])
-    sources = tuple(entries.source(c) for entries, c in zip(sources, conditions) if entries.slots)
-    return jnp.asarray(rows.astype(np.int32)), indices[None], weights[None], sources
+    given = tuple(entries.source(c) for entries, c in zip(sources, conditions) if entries.slots)
+    return jnp.asarray(rows.astype(np.int32)), indices[None], weights[None], given
 
 
 def _carried(x, m: int, pick, share) -> Float[Array, " p"]:

@@ -1,20 +1,28 @@
-"""All tests run in float64 and share one compilation cache, across workers and runs."""
+"""All tests run in float64, with annotations checked, and share one compilation cache.
 
+Of the cache environment variables tell, so that the commands that tests start have it too. Float64
+is not among them: those commands must ask for it themselves.
+"""
+
+import importlib.util
+import os
 from pathlib import Path
+
+CACHE = Path(__file__).resolve().parents[1] / ".cache" / "jax"
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # what is loaded from it was tuned: no news
+os.environ.setdefault("MPLBACKEND", "Agg")
 
 import jax
 import pytest
+from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent / ".cache" / "jax"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+if importlib.util.find_spec("beartype"):
+    from . import annotations  # noqa: F401, named below
 
-try:
-    import matplotlib
-
-    matplotlib.use("Agg")
-except ImportError:
-    pass
+    install_import_hook("jaxsurf", "tests.annotations.check")
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -123,10 +123,11 @@ def _pair(mass, stiff, tentative):
     # In one complex matrix both get one layout.
     both = (mass + 1j * stiff).tocsr()
     pad = lambda a: PaddedMatrix.from_scipy(a.tocsr(), np.dtype(np.float32))
-    parts = [pad(part) for a in (both, both.T.tocsr()) for part in (a.real, a.imag)]
+    turned = both.T.tocsr()
     vector = lambda a: jnp.asarray(a.astype(np.float32))
     pair = _Pair(
-        *parts, vector(beside), vector(below), pad(restrict), pad(prolong),
+        pad(both.real), pad(both.imag), pad(turned.real), pad(turned.imag),
+        vector(beside), vector(below), pad(restrict), pad(prolong),
         max(radius, jacobi_radius(mass, 1 / beside)),
     )  # fmt: skip
     return pair, (restrict @ (mass @ prolong)).tocsr(), (restrict @ (stiff @ prolong)).tocsr()

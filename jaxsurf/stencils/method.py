@@ -115,6 +115,6 @@ def with_center(eta: Float[Array, "c k *p"]) -> Float[Array, "c k *p"]:
     return eta.at[:, 0].set(-jnp.sum(eta[:, 1:], axis=1))
 
 
-def dot(a: Float[Array, "k d *p"], b: Float[Array, "k d *p"]) -> Float[Array, "k *p"]:
+def dot(a: Float[Array, "k d *p"], b: Float[Array, "#k d *p"]) -> Float[Array, "k *p"]:
     """Scalar products; written out, as sums over an axis between others are slow."""
     return sum((a[:, i] * b[:, i] for i in range(1, a.shape[1])), a[:, 0] * b[:, 0])

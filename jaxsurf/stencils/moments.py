@@ -58,7 +58,7 @@ def moment_solve(
 
 def _solve(x, w, b, low, high):
     """What `moment_solve` returns, and what its derivative needs of it."""
-    v = monomial_rows(x, high)
+    v: list[Array] | Array = monomial_rows(x, high)
     start = len(multi_indices(len(x), 0, low - 1))
     b = [row.reshape(-1, *(1,) * (w.ndim - 1)) for row in b.astype(w.dtype)]
     if len(b) > systems.SMALL:

@@ -44,14 +44,14 @@ def _parents(dim: int, high: int) -> tuple[tuple[int, int], ...]:
     return tuple(parents)
 
 
-def monomials(x: Float[Array, "dim q"], high: int) -> Float[Array, "m q"]:
+def monomials(x: Float[Array, "dim *q"], high: int) -> Float[Array, "m *q"]:
     """All monomials of degree 0 to `high`, one multiplication each."""
     return jnp.stack(monomial_rows(x, high))
 
 
 def monomial_rows(
-    x: Float[Array, "dim q"], high: int, first: Float[Array, " q"] | None = None
-) -> list[Float[Array, " q"]]:
+    x: Float[Array, "dim *q"], high: int, first: Float[Array, "*q"] | None = None
+) -> list[Float[Array, "*q"]]:
     """The same one by one, all times a common factor `first` if given."""
     rows = [jnp.ones_like(x[0]) if first is None else first]
     for lower, axis in _parents(x.shape[0], high):

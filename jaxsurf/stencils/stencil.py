@@ -232,7 +232,7 @@ class Composition(AbstractOperator):
     @property
     def border(self):
         marked = [b for b in (self.inner.border, self.outer.border) if b is not None]
-        either = np.logical_or if is_concrete(*marked) else jnp.logical_or
+        either = (np if is_concrete(*marked) else jnp).logical_or
         return functools.reduce(either, marked) if marked else None
 
     def __call__(self, u):
@@ -294,7 +294,8 @@ def _sum_slots_jvp(contracted, primals, tangents):
 
 def _scan_slots(weights, indices, values, contracted: int):
     def add_slot(total, slot):
-        return total + _term(*slot, values, contracted), None
+        w, j = slot
+        return total + _term(w, j, values, contracted), None
 
     zero = _zero(weights, values, contracted)
     return jax.lax.scan(add_slot, zero, (weights, indices))[0]

@@ -132,7 +132,8 @@ class _Forward(eqx.Module):
 
 @eqx.filter_custom_vjp
 def _last(inputs, rows, stages):
-    forward = _Forward(*inputs, rows)
+    increment, y0, k0 = inputs
+    forward = _Forward(increment, y0, k0, rows)
     return forward.upto(jnp.asarray(1, stages.dtype), forward.first(), stages)[0]
 
 

@@ -154,7 +154,7 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         rate = jnp.zeros_like(u)
         if self.advection is not None:
             rate = rate - self.advection(u)
-        if self.velocity is not None:
+        if self.velocity is not None and self.gradient is not None:
             rate = rate - _advected(self.gradient, self.velocity(t), u, self.conservative)
         if self.stabilization is not None:
             rate = rate + self.stabilization(u)
@@ -192,7 +192,7 @@ class BiharmonicDiffusion(AbstractEvolution):
 
     def linear(self, t, u):
         inner = _homogeneous(self.conditions, self.laplacian(u))
-        return _balanced(-self.stiffness * self.laplacian(inner), self.mass)
+        return _balanced(self.laplacian(inner) * -jnp.asarray(self.stiffness), self.mass)
 
     def rest(self, t, u, args):
         if self.reaction is None:
@@ -235,7 +235,7 @@ class CahnHilliard(AbstractEvolution):
 
     def _driven(self, potential):
         potential = _homogeneous(self.conditions, potential)
-        return _balanced(self.mobility * self.laplacian(potential), self.mass)
+        return _balanced(self.laplacian(potential) * jnp.asarray(self.mobility), self.mass)
 
     def linear(self, t, u):
         return self._driven(self.splitting * u - self.width**2 * self.laplacian(u))

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax
 from tqdm import tqdm
 
-from . import cases, heat
+from ..report import table as rows_table
+from ..report import write_json
+from . import cases, heat, prompt
 
 # Measured on a 2-core machine of the same kind, one process each: build s and apply ms at 1e5.
 PEERS = {
@@ -46,9 +50,12 @@ def plan(quick: bool) -> list[tuple[str, list]]:
 
 def run_case(name: str, arguments: list) -> dict:
     command = [sys.executable, "-m", "experiments.benchmarks", "--case", name]
+    # Compiled anew, whatever cache the environment has.
+    environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     done = subprocess.run(
-        [*command, json.dumps(arguments)], capture_output=True, text=True, check=False
-    )
+        [*command, json.dumps(arguments)],
+        capture_output=True, text=True, check=False, env=environment,
+    )  # fmt: skip
     if done.returncode:
         raise RuntimeError(f"{name} {arguments} failed:\n{done.stderr[-2000:]}")
     return json.loads(done.stdout.splitlines()[-1])
@@ -120,8 +127,11 @@ def table(results: list[dict], quick: bool) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m experiments.benchmarks", description=__doc__)
-    parser.add_argument("group", nargs="?", default="stencils", choices=["stencils", "heat"])
+    parser.add_argument(
+        "group", nargs="?", default="stencils", choices=["stencils", "heat", "prompt"]
+    )
     parser.add_argument("--quick", action="store_true", help="smaller sizes")
+    parser.add_argument("--only", metavar="NAME", help="cases of one function or method")
     parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR")
     parser.add_argument("--readme", action="store_true", help="put the table into the README")
     parser.add_argument("--case", nargs=2, metavar=("NAME", "ARGUMENTS"), help=argparse.SUPPRESS)
@@ -130,16 +140,26 @@ def main() -> None:
         jax.config.update("jax_enable_x64", True)
         name, arguments = options.case
         module, _, function = name.rpartition(".")
-        case = getattr({"": cases, "heat": heat}[module], function)
+        case = getattr({"": cases, "heat": heat, "prompt": prompt}[module], function)
         print(json.dumps(case(*json.loads(arguments))))
         return
-    results = []
-    todo = heat.plan(options.quick) if options.group == "heat" else plan(options.quick)
+    start, results = time.perf_counter(), []
+    plans = {"stencils": plan, "heat": heat.plan, "prompt": prompt.plan}
+    todo = [
+        (name, arguments)
+        for name, arguments in plans[options.group](options.quick)
+        if not options.only or options.only in arguments
+    ]
     for name, arguments in tqdm(todo, desc="benchmarks", unit="case"):
         result = run_case(name, arguments)
         results.append({"case": name, "arguments": arguments, "result": result})
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / f"{options.group}.json").write_text(json.dumps(results, indent=1))
+    if options.group == "prompt":
+        rows = prompt.rows(results)
+        write_json(options.out / "prompt.json", "prompt", rows, time.perf_counter() - start)
+        print(rows_table(rows))
+        sys.exit(any(row.holds is False for row in rows))
     if options.group == "heat":
         print(json.dumps(results, indent=1))
         return

@@ -1,0 +1,242 @@
+"""At the prompt: what a first call, the same call again, and a call with other values cost.
+
+Every function in a process of its own, with nothing compiled and no cache on disk. What a user has
+made before, the cloud and its operator, say, is made before the clock starts.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxsurf as js
+
+from ..report import Row
+
+N = 2_500
+_FIRST, _ABOVE = 3.0, 20.0
+# Going to the compiler and back: all that a call does beside its work.
+_EVENTS = ("jaxpr_trace_duration", "jaxpr_to_mlir_module_duration", "backend_compile_duration")
+
+
+class _Compiler:
+    """Seconds spent in tracing and compiling, and the number of programs compiled."""
+
+    def __init__(self):
+        self.seconds, self.programs = 0.0, 0
+        jax.monitoring.register_event_duration_secs_listener(self._note)
+
+    def _note(self, event: str, seconds: float, **_):
+        kind = event.rpartition("/")[2]
+        if kind in _EVENTS:
+            self.seconds += seconds
+            self.programs += kind == "backend_compile_duration"
+
+
+def _clock(call: Callable) -> float:
+    """Seconds by the clock on the wall or of the processor, the fewer.
+
+    A busy machine keeps a process waiting: its own time is then nearer to what it takes alone.
+    """
+    wall, own = time.perf_counter(), time.process_time()
+    jax.block_until_ready(call())
+    return min(time.perf_counter() - wall, time.process_time() - own)
+
+
+def stretched(cloud: js.PointCloud) -> js.PointCloud:
+    """Another surface with as many points."""
+    factors = jnp.array([1.1, 1.0, 0.9])[: cloud.points.shape[1]]
+    normals = cloud.normals / factors
+    normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+    return js.PointCloud(cloud.points * factors, normals, boundary=cloud.boundary)
+
+
+def _phi(x):
+    return jnp.sum(x**4) - 1
+
+
+def _egg(x):
+    return jnp.sum(x**4) + 0.2 * x[0] * x[1] - 1
+
+
+def _saddle(x, y):
+    return 0.3 * x * y
+
+
+def _cubic(t, u, args):
+    return u - u**3
+
+
+class Made:
+    """What calls need; each thing is made when it is first asked for."""
+
+    def __init__(self, cloud: js.PointCloud, number: float):
+        self.cloud, self.number = cloud, number
+        self.u = jnp.asarray(np.sin(2 * np.asarray(cloud.points[:, 0])))
+
+    def __getattr__(self, name):
+        value = {
+            "neighbors": lambda: js.choose_neighbors(self.cloud),
+            "laplacian": lambda: js.laplace_beltrami(self.cloud),
+            "gradient": lambda: js.surface_gradient(self.cloud),
+            "conditions": lambda: js.dirichlet(self.cloud.boundary),
+            "closure": lambda: js.close(self.cloud, self.conditions),
+            "preconditioner": lambda: js.multigrid(self.laplacian),
+            "problem": lambda: js.AdvectionDiffusionReaction(
+                self.laplacian, diffusivity=self.number
+            ),
+            "capacity": lambda: js.allocate(self.cloud.points, 0.15),
+            "spin": lambda: jnp.cross(jnp.array([0.0, 0.0, 1.0]), self.cloud.points),
+        }[name]()
+        self.__dict__[name] = value
+        return value
+
+
+# Name: what has to be there before, and the call. `closed` and `open` are the surface.
+CALLS: dict[str, tuple[str, str, Callable]] = {
+    "ellipsoid": ("closed", "", lambda m: js.ellipsoid(N, (1.0, 0.8, 0.5 + m.number)).points),
+    "torus": ("closed", "", lambda m: js.torus(N, 1.0, 0.4 * m.number).points),
+    "level_set": (
+        "closed",
+        "",
+        lambda m: js.level_set(
+            _phi if m.number == 1 else _egg, n=N, bounds=((-1.5,) * 3, (1.6,) * 3)
+        ).points,
+    ),
+    "estimate_normals": ("closed", "", lambda m: js.estimate_normals(m.cloud.points)),
+    "find_neighbors": ("closed", "", lambda m: js.find_neighbors(m.cloud, k=30).indices),
+    "choose_neighbors": ("closed", "", lambda m: js.choose_neighbors(m.cloud).indices),
+    "search_neighbors": (
+        "closed",
+        "capacity",
+        lambda m: js.search_neighbors(
+            m.cloud.points, radius=0.15 * m.number, capacity=m.capacity, throw=False
+        )[0].indices,
+    ),
+    "laplace_beltrami": ("closed", "", lambda m: js.laplace_beltrami(m.cloud).weights),
+    "laplace_beltrami, GFDM(degree=4)": (
+        "closed",
+        "",
+        lambda m: js.laplace_beltrami(m.cloud, method=js.GFDM(degree=4)).weights,
+    ),
+    "surface_gradient": ("closed", "", lambda m: js.surface_gradient(m.cloud).weights),
+    "surface_divergence": ("closed", "", lambda m: js.surface_divergence(m.cloud).weights),
+    "diffusion": ("closed", "", lambda m: js.diffusion(m.cloud, 1 + m.u**2).weights),
+    "mean_curvature": ("closed", "", lambda m: js.mean_curvature(m.cloud)),
+    "principal_curvatures": ("closed", "", lambda m: js.principal_curvatures(m.cloud)),
+    "L(u)": ("closed", "laplacian", lambda m: m.laplacian(m.u)),
+    "G(u)": ("closed", "gradient", lambda m: m.gradient(m.u)),
+    "spectral_estimate": (
+        "closed",
+        "laplacian",
+        lambda m: js.spectral_estimate(m.laplacian).radius,
+    ),
+    "multigrid": ("closed", "laplacian", lambda m: js.multigrid(m.laplacian)),
+    "solve": ("closed", "laplacian", lambda m: js.solve(m.laplacian, m.laplacian(m.u)).value),
+    "solve, Dirichlet": (
+        "open",
+        "laplacian closure",
+        lambda m: js.solve(m.laplacian, m.u, conditions=m.closure).value,
+    ),
+    "close": ("open", "conditions", lambda m: js.close(m.cloud, m.conditions)),
+    "with_ghosts": ("open", "", lambda m: js.with_ghosts(m.cloud, js.neumann(m.cloud.boundary))),
+    "solve_nonlinear": (
+        "closed",
+        "laplacian",
+        lambda m: js.solve_nonlinear(m.laplacian, _nonlinear, m.u, args=m.number).value,
+    ),
+    "eigenmodes": ("closed", "laplacian", lambda m: js.eigenmodes(m.laplacian, 6).values),
+    "geodesic_distance": (
+        "closed",
+        "neighbors",
+        lambda m: js.geodesic_distance(m.cloud, np.array([int(7 * m.number)])),
+    ),
+    "integrate": (
+        "closed",
+        "problem",
+        lambda m: js.integrate(m.problem, m.u, t1=0.05 * m.number, rtol=1e-4 * m.number).ys,
+    ),
+    "integrate, IMEX": (
+        "closed",
+        "laplacian",
+        lambda m: (
+            js.integrate(
+                js.AdvectionDiffusionReaction(
+                    m.laplacian, diffusivity=m.number, reaction=_cubic
+                ),
+                m.u,
+                t1=0.05 * m.number,
+                solver=js.IMEX(order=3),
+                dt0=0.005,
+            ).ys
+        ),
+    ),
+    "hyperviscosity": (
+        "closed",
+        "laplacian",
+        lambda m: js.hyperviscosity(m.laplacian, 1.0 * m.number)(m.u),
+    ),
+    "upwinding": ("closed", "spin", lambda m: js.upwinding(m.cloud, m.spin).weights),
+}  # fmt: skip
+
+
+def _nonlinear(u, args):
+    return u + args * u**3
+
+
+def one(name: str, n: int) -> dict:
+    """First call, five more, and two with another surface and other numbers."""
+    surface, needs, call = CALLS[name]
+    cloud = js.sphere(n) if surface == "closed" else js.graph(_saddle, n)
+    clouds = [cloud, stretched(cloud)]
+    if surface == "open":  # the same points, of the same border
+        clouds = [cloud, js.PointCloud(1.1 * cloud.points, cloud.normals, boundary=cloud.boundary)]
+    made, other = (Made(c, number) for c, number in zip(clouds, (1.0, 1.1)))
+    for need in needs.split():
+        jax.block_until_ready((getattr(made, need), getattr(other, need)))
+    compiler = _Compiler()
+    first = _clock(lambda: call(made))
+    programs = compiler.programs
+    again, above = [], []
+    for _ in range(5):
+        before = compiler.seconds
+        again.append(_clock(lambda: call(made)))
+        above.append(min(again[-1], compiler.seconds - before))
+    repeated = compiler.programs - programs
+    new = _clock(lambda: call(other))
+    return {"first s": first, "again s": statistics.median(again),
+            "above ms": 1e3 * statistics.median(above), "programs": programs,
+            "programs again": repeated, "new s": new,
+            "programs new": compiler.programs - programs - repeated}  # fmt: skip
+
+
+def plan(quick: bool) -> list[tuple[str, list]]:
+    n = 500 if quick else N
+    todo: list[tuple[str, list]] = [("prompt.one", [name, n]) for name in CALLS]
+    return (
+        todo
+        if quick
+        else [*todo, ("prompt.one", ["L(u)", 10_000]), ("prompt.one", ["G(u)", 10_000])]
+    )
+
+
+def rows(results: list[dict]) -> list[Row]:
+    """The bounds that all of it must keep."""
+    found = []
+    for r in results:
+        (name, n), v = r["arguments"], r["result"]
+        setting = {"call": name, "n": n}
+        found += [
+            Row("first call, s", v["first s"], setting, bound=_FIRST),
+            Row("again, s", v["again s"], setting),
+            Row("again: tracing and compiling, ms", v["above ms"], setting, bound=_ABOVE),
+            Row("again: programs compiled", v["programs again"], setting, bound=0),
+            Row("other values, s", v["new s"], setting),
+            Row("other values: programs compiled", v["programs new"], setting, bound=0),
+        ]
+    return found

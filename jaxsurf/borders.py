@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .arguments import is_concrete
+from .arguments import instance, is_concrete, raise_at, real, whole
 from .cloud import PointCloud
 from .frames import tangent_frames
-from .neighbors import nearest
+from .neighbors import distance_key, nearest
 from .shapes.meshes import TriangleMesh
 
 # Points in a row that the border is interpolated through.
@@ -24,8 +24,9 @@ _ROW = 5
 # A corner turns by more than this, in radians, and this many times as much as the points beside
 # it; whatever turns by more than the last is one.
 _TURN, _TIMES, _SHARP = 0.3, 2.5, 1.0
-# Along a border, the second neighbour is off by at least this cosine from the first.
-_ASIDE = 0.5
+# Along a border, the second neighbour is off by at least this cosine from the first, and not
+# farther than so many spacings. Not those of a lattice: there the last bit would decide.
+_ASIDE, _FAR = 0.49, 4.03
 # Neighbours looked at for the largest empty angle, and the angle that makes a border.
 _RING, _GAP = 16, 2.1
 
@@ -46,12 +47,33 @@ class Border(eqx.Module):
     rows: Int[Array, "2 m r"]
     mask: Bool[Array, "2 m r"]
 
+    def __check_init__(self):
+        m, shape = np.shape(self.points), np.shape(self.rows)
+        if len(m) != 1 or not m[0]:
+            raise ValueError(f"points has shape {m}, expected (m,) with at least 1 point")
+        if len(shape) != 3 or shape[:2] != (2, *m) or shape[2] < 2:
+            raise ValueError(f"rows has shape {shape}, expected (2, {m[0]}, r)")
+        if np.shape(self.mask) != shape:
+            raise ValueError(f"mask has shape {np.shape(self.mask)}, expected {shape}")
+        for name in ("points", "rows"):
+            given = getattr(self, name)
+            if given.dtype.kind not in "iu":
+                raise TypeError(f"{name} is of type {given.dtype}, expected indices")
+            if is_concrete(given):
+                raise_at(np.ravel(given) < 0, f"{name} names point {{v}}", np.ravel(given))
+
+    def __repr__(self):
+        _, m, r = self.rows.shape
+        corners = int(self.corners.sum()) if is_concrete(self.rows) else "?"
+        return f"Border({m} points, {corners} corners, rows of up to {r} points)"
+
     @property
     def corners(self) -> Bool[np.ndarray, " m"]:
         """True where two smooth pieces meet; on the host, also while the cloud is traced."""
         before, after = np.asarray(self.rows)
         return np.any(before != after, axis=1)
 
+    @eqx.filter_jit
     def conormals(self, cloud: PointCloud) -> Float[Array, "m d"]:
         """Outward unit conormals; at a corner the mean direction of both sides."""
         sides = [self.side_conormals(cloud, side) for side in (0, 1)]
@@ -63,6 +85,7 @@ class Border(eqx.Module):
         slot = jnp.arange(len(self.points))
         return self.at(cloud, side, slot, cloud.points[self.points])[2]
 
+    @eqx.filter_jit
     def at(self, cloud: PointCloud, side, slot, near: Float[Array, "p d"]):
         """Foot points on the border, and the geometry there.
 
@@ -98,7 +121,8 @@ class Border(eqx.Module):
         tangent = jnp.einsum("pr,prd->pd", slope, points)
         normal = _unit(jnp.einsum("pr,prd->pd", value, normals))
         conormal = _unit(jnp.cross(tangent, normal))
-        smooth = mask & ~jnp.isin(rows, self.points[self.corners])
+        turns = jnp.any(self.rows[0] != self.rows[1], axis=1)
+        smooth = mask & ~jnp.zeros(cloud.n, bool).at[self.points].set(turns)[rows]
         return foot, normal, conormal, _lagrange(nodes, smooth, x)[0]
 
 
@@ -159,8 +183,20 @@ def border_conormals(cloud: PointCloud, border: Border | None = None) -> Float[A
         >>> bool(jnp.abs(js.border_conormals(cap) - exact).max() < 1e-3)
         True
     """
-    border = find_border(cloud) if border is None else border
-    return border.conormals(cloud)[jnp.argsort(border.points)]
+    instance(cloud, PointCloud, "cloud")
+    border = find_border(cloud) if border is None else checked_border(border, cloud)
+    order = np.argsort(border.points) if is_concrete(border.points) else jnp.argsort(border.points)
+    return border.conormals(cloud)[order]
+
+
+def checked_border(border: Border, cloud: PointCloud) -> Border:
+    """Refuse what is no border, or that of a larger cloud."""
+    instance(border, Border, "border", "made by js.find_border")
+    if is_concrete(border.points):
+        last = int(np.max(border.points))
+        if last >= cloud.n:
+            raise ValueError(f"border names point {last}, the cloud has {cloud.n}")
+    return border
 
 
 def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
@@ -177,12 +213,15 @@ def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
         The border, with the surface on its left.
 
     Raises:
+        TypeError: no cloud, no mesh.
         ValueError: traced arrays; no point marked; a marked point without a neighbour along the
             border (named by index); a mesh with another number of vertices, or without border.
     """
+    instance(cloud, PointCloud, "cloud")
     if not is_concrete(cloud.points, cloud.normals, cloud.boundary):
-        raise ValueError("find_border needs concrete arrays; find it first and pass it on")
+        raise ValueError("find_border needs a concrete cloud; find it first and pass it on")
     if mesh is not None:
+        instance(mesh, TriangleMesh, "mesh")
         if len(mesh.vertices) != cloud.n:
             raise ValueError(f"the mesh has {len(mesh.vertices)} vertices, the cloud {cloud.n}")
         if mesh.closed:
@@ -194,7 +233,7 @@ def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
     if not marked.any():
         raise ValueError("no point is marked in cloud.boundary; see detect_border")
     points = np.asarray(cloud.points, float)
-    inside = _inward(points, np.flatnonzero(on), np.flatnonzero(marked))
+    inside = inward(points, np.flatnonzero(on), np.flatnonzero(marked))
     if cloud.dim == 2:
         return _ends(points, np.flatnonzero(on), np.flatnonzero(marked))
     names = np.flatnonzero(marked)
@@ -222,6 +261,7 @@ def detect_border(cloud: PointCloud, *, k: int = _RING, gap: float = _GAP) -> Bo
         out: look at it before use.
 
     Raises:
+        TypeError: no cloud; k that is no whole number, gap that is no number.
         ValueError: traced arrays; k or gap out of range.
 
     Example:
@@ -230,12 +270,11 @@ def detect_border(cloud: PointCloud, *, k: int = _RING, gap: float = _GAP) -> Bo
         >>> bool((js.detect_border(cap) == cap.boundary).all())
         True
     """
+    instance(cloud, PointCloud, "cloud")
     if not is_concrete(cloud.points, cloud.normals):
-        raise ValueError("detect_border needs concrete arrays")
-    if not 3 <= k <= cloud.n:
-        raise ValueError(f"k = {k} neighbours, expected 3 to {cloud.n}")
-    if not 0 < gap < np.pi:
-        raise ValueError(f"gap = {gap}, expected an angle between 0 and π")
+        raise ValueError("detect_border needs a concrete cloud")
+    whole(k, "k", least=3, most=cloud.n)
+    real(gap, "gap", above=0, below=np.pi)
     on = cloud.host_active
     rows = np.flatnonzero(on)
     points, normals = np.asarray(cloud.points, float)[rows], np.asarray(cloud.normals)[rows]
@@ -260,7 +299,7 @@ def detect_border(cloud: PointCloud, *, k: int = _RING, gap: float = _GAP) -> Bo
 # --- order along the border ----------------------------------------------------------------
 
 
-def _inward(points, on, border):
+def inward(points, on, border):
     """Mean offset from each border point to the points around it."""
     count = min(4 * points.shape[1], len(on))
     near = cKDTree(points[on]).query(points[border], count)[1]
@@ -273,20 +312,24 @@ def _links(points, names) -> list[list[int]]:
     if count < 2:
         raise ValueError(f"border point {names[0]} is alone; a border has at least 2 points")
     distance, near = cKDTree(points).query(points, count)
+    # What is equally far comes by its number, whatever the last bit says.
+    order = np.lexsort((near, distance_key(distance**2)), axis=1)
+    distance, near = (np.take_along_axis(x, order, axis=1) for x in (distance, near))
     d = (points[near] - points[:, None])[:, 1:]
     near, distance = near[:, 1:], distance[:, 1:]
     first = d[:, 0] / distance[:, :1]
     cosine = np.einsum("nkd,nd->nk", d, first) / distance
-    other = (cosine < _ASIDE) & (distance < 4 * np.median(distance[:, 0]))
+    other = (cosine < _ASIDE) & (distance < _FAR * np.median(distance[:, 0]))
     second = np.where(other.any(axis=1), near[np.arange(len(near)), np.argmax(other, axis=1)], -1)
     wanted = {(i, int(j)) for i, j in enumerate(near[:, 0])}
     wanted |= {(i, int(j)) for i, j in enumerate(second) if j >= 0}
     pairs = {(min(p), max(p)) for p in wanted}
-    length = {p: float(np.linalg.norm(points[p[0]] - points[p[1]])) for p in pairs}
+    squared = np.array([np.sum((points[i] - points[j]) ** 2) for i, j in pairs])
+    length = dict(zip(pairs, distance_key(squared).tolist()))
     links: list[list[int]] = [[] for _ in names]
     # Links that both ends ask for come first, then short ones.
     mutual = {p for p in pairs if p in wanted and p[::-1] in wanted}
-    for i, j in sorted(pairs, key=lambda p: (p not in mutual, length[p])):
+    for i, j in sorted(pairs, key=lambda p: (p not in mutual, length[p], p)):
         if len(links[i]) < 2 and len(links[j]) < 2:
             links[i].append(j)
             links[j].append(i)

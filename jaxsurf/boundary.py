@@ -14,6 +14,7 @@ $\dot v = P\,F(t, E v + e(t))$.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import zip_longest
 
 import equinox as eqx
 import jax
@@ -22,8 +23,8 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
-from .arguments import is_concrete
-from .borders import Border, find_border
+from .arguments import as_float, instance, is_concrete, raise_at, real, whole
+from .borders import Border, checked_border, find_border, inward
 from .build import residual_tolerance, stencil_weights
 from .cloud import PointCloud
 from .conditions import Condition, checked_conditions
@@ -52,10 +53,12 @@ class Source(eqx.Module):
     pick: Int[Array, " e"]
     condition: Condition
 
-    def at(self, t) -> Float[Array, "e *c"]:
-        g = self.condition.at(t)
-        g = jnp.broadcast_to(g, (self.condition.m, *g.shape[1:]))[self.pick]
-        return self.factor.reshape(-1, *[1] * (g.ndim - 1)) * g
+    def at(self, t) -> _Given:
+        """At a time, in the form that `_filled` takes."""
+        return self.slots, self.factor, self.pick, self.condition.at(t)
+
+
+_Given = tuple[Array, Array, Array, Array]
 
 
 class Closure(eqx.Module):
@@ -81,6 +84,27 @@ class Closure(eqx.Module):
     sources: tuple[Source, ...] = ()
     declared: Bool[Array, " n"] | None = None
 
+    def __check_init__(self):
+        whole(self.n, "n", least=1)
+        k, m = np.shape(self.indices)[:1], np.shape(self.rows)
+        wanted = {"rows": m[:1], "indices": (*k, *m), "weights": (*k, *m), "declared": (self.n,)}
+        for name, shape in wanted.items():
+            found = getattr(self, name)
+            if found is not None and (np.shape(found) != shape or len(m) != 1):
+                raise ValueError(f"{name} has shape {np.shape(found)}, expected {shape}")
+        for name in ("rows", "indices"):
+            found = getattr(self, name)
+            if is_concrete(found):
+                bad = np.ravel((np.asarray(found) < 0) | (np.asarray(found) >= self.n))
+                raise_at(bad, f"{name} names point {{v}}, there are {self.n}", np.ravel(found))
+
+    def __repr__(self):
+        said = ", ".join(repr(source.condition) for source in self.sources) or "no condition"
+        if self.declared is not None and is_concrete(self.declared, self.rows):
+            free = int(np.sum(np.asarray(self.declared) & ~np.asarray(self.bound)))
+            said += f", free({free} points)" * (free > 0)
+        return f"Closure({self.m} of {self.n} points bound: {said})"
+
     @property
     def m(self) -> int:
         """Number of bound points."""
@@ -92,23 +116,33 @@ class Closure(eqx.Module):
         return jnp.zeros(self.n, bool).at[self.rows].set(True)
 
     def __call__(self, u: Float[Array, "n *c"], t=0.0) -> Float[Array, "n *c"]:
-        """The field with its bound values replaced by those that follow at time t."""
-        u = self._field(u)
-        values, offset = self._linear(u), self._offset(t)
-        if offset.ndim > values.ndim:
-            raise ValueError(f"values have components {offset.shape[1:]}, the field has none")
-        offset = offset.reshape(*offset.shape, *[1] * (values.ndim - offset.ndim))
-        return u.at[self.rows].set(values + offset)
+        """The field with its bound values replaced by those that follow at time t.
+
+        Args:
+            u: the field; its bound values are not looked at.
+            t: time, for conditions whose values are functions of it.
+
+        Raises:
+            TypeError: no array of real numbers.
+            ValueError: another number of points; values with components for a field without.
+        """
+        u, given = self._field(u), self._given(t)
+        components = _components(given)
+        if len(components) > u.ndim - 1:
+            raise ValueError(f"values have components {components}, the field has none")
+        if any(c not in (1, own) for c, own in zip(components, u.shape[1:])):
+            raise ValueError(f"values have components {components}, the field {u.shape[1:]}")
+        return _filled(u, self.rows, self.indices, self.weights, given)
 
     def homogeneous(self, u: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
         """The linear part E u, which ignores the bound values of u."""
-        u = self._field(u)
-        return u.at[self.rows].set(self._linear(u))
+        return _filled(self._field(u), self.rows, self.indices, self.weights, ())
 
     def offset(self, t=0.0) -> Float[Array, "n *c"]:
         """The affine part e at time t; zero at free points."""
-        values = self._offset(t)
-        return jnp.zeros((self.n, *values.shape[1:]), values.dtype).at[self.rows].set(values)
+        given = self._given(t)
+        shape, dtype = (self.n, *_components(given)), self.weights.dtype
+        return _filled(jnp.zeros(shape, dtype), self.rows, self.indices, self.weights, given)
 
     def restrict(self, u: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
         """The field with its bound values set to zero."""
@@ -116,7 +150,9 @@ class Closure(eqx.Module):
 
     def extend(self, u: Float[Array, "p *c"], t=0.0) -> Float[Array, "n *c"]:
         """A field of the first p points, for a cloud with ghosts after them, filled in."""
-        u = jnp.asarray(u)
+        u = as_float(u, "field")
+        if u.ndim < 1 or len(u) > self.n:
+            raise ValueError(f"field has shape {u.shape}, expected at most {self.n} points")
         return self(jnp.concatenate([u, jnp.zeros((self.n - len(u), *u.shape[1:]), u.dtype)]), t)
 
     @property
@@ -142,23 +178,36 @@ class Closure(eqx.Module):
         return matrix
 
     def _field(self, u):
-        u = jnp.asarray(u)
+        u = as_float(u, "field")
         if u.ndim < 1 or u.shape[0] != self.n:
             raise ValueError(f"field has shape {u.shape}, expected ({self.n}, ...)")
         return u
 
-    def _linear(self, u):
-        weights = self.weights.reshape(*self.weights.shape, *[1] * (u.ndim - 1))
-        return jnp.sum(weights * u[self.indices], axis=0)
+    def _given(self, t) -> tuple[_Given, ...]:
+        # The values here and the rest in one compiled function, which a new function of time
+        # leaves as it is.
+        real(t, "t")
+        return tuple(source.at(t) for source in self.sources)
 
-    def _offset(self, t):
-        parts = [source.at(t) for source in self.sources]
-        shape = jnp.broadcast_shapes(*(part.shape[1:] for part in parts))
-        total = jnp.zeros((self.m, *shape), jnp.result_type(self.weights, *parts))
-        for source, part in zip(self.sources, parts):
-            part = part.reshape(*part.shape, *[1] * (len(shape) + 1 - part.ndim))
-            total = total.at[source.slots].add(part)
-        return total
+
+def _components(given) -> tuple[int, ...]:
+    """Components per point of prescribed values."""
+    sizes = zip_longest(*(g.shape[1:] for *_, g in given), fillvalue=1)
+    return tuple(max(size) for size in sizes)
+
+
+@jax.jit
+def _filled(u, rows, indices, weights, given):
+    """u with the values at `rows` replaced: a linear part and what is prescribed."""
+    shape = u.shape[1:]
+    linear = weights.reshape(*weights.shape, *[1] * len(shape))
+    values = jnp.sum(linear * u[indices], axis=0)
+    for slots, factor, pick, g in given:
+        g = (g[pick] if g.ndim else g[None]).astype(factor.dtype)
+        g = g.reshape(*g.shape, *[1] * (len(shape) + 1 - g.ndim))
+        part = factor.reshape(-1, *[1] * len(shape)) * g
+        values = values.at[slots].add(jnp.broadcast_to(part, (len(slots), *shape)))
+    return u.at[rows].set(values.astype(u.dtype))
 
 
 def close(
@@ -198,9 +247,12 @@ def close(
     Differentiable: forward and reverse, in points, normals, values, a, b and conormals, for
     fixed neighbours.
     Raises:
-        ValueError: contradictory conditions; no conormal; fewer free neighbours than the method
-            needs; a + b w_i near zero, with w_i the weight of the point itself in its conormal
-            derivative (a Robin condition of the wrong sign); each with the point.
+        TypeError: what is no cloud, condition, neighbours, method or border.
+        ValueError: contradictory conditions; no conormal, or one that is not tangent to the
+            surface or leads into it; a mask or neighbours of another number of points; fewer free
+            neighbours than the method needs; a + b w_i near zero, with w_i the weight of the point
+            itself in its conormal derivative (a Robin condition of the wrong sign); each with
+            the point.
 
     Example:
         >>> cloud = js.sphere(500)
@@ -210,6 +262,8 @@ def close(
         True
     """
     conditions, owner = checked_conditions(cloud, conditions)
+    instance(method, AbstractMethod, "method", "as js.GFDM(degree=2)")
+    check_parts(cloud, neighbors, border)
     free, declared = cloud.host_active.copy(), np.zeros(cloud.n, bool)
     for condition in conditions:
         declared[condition.where] = True
@@ -243,6 +297,16 @@ def close(
         start += m
     rows, indices, weights = stacked(parts, int(np.argmax(free)), dtype)
     return Closure(cloud.n, rows, indices, weights, tuple(sources), jnp.asarray(declared))
+
+
+def check_parts(cloud, neighbors, border) -> None:
+    """Refuse neighbours and borders that are none, or of another cloud."""
+    if neighbors is not None:
+        instance(neighbors, Neighbors, "neighbors", "made by js.find_neighbors")
+        if neighbors.n != cloud.n:
+            raise ValueError(f"neighbours of {neighbors.n} points, the cloud has {cloud.n}")
+    if border is not None:
+        checked_border(border, cloud)
 
 
 def check_border(operator: AbstractOperator, conditions: Closure | None) -> None:
@@ -292,10 +356,8 @@ def stacked(parts, free: int, dtype):
 def _conormals(cloud, condition, rows, own, border) -> Float[Array, "m d"]:
     """Those of the condition; else those of the border."""
     if condition.conormals is not None:
-        if condition.conormals.shape[1:] != (cloud.dim,):
-            shape = condition.conormals.shape
-            raise ValueError(f"conormals have shape {shape}, expected (..., {cloud.dim})")
-        return condition.conormals[own]
+        _check_conormals(cloud, condition)
+        return condition.conormals[own].astype(cloud.points.dtype)
     if border is None and cloud.boundary is not None:
         border = find_border(cloud)
     place = np.full(cloud.n, -1)
@@ -309,6 +371,38 @@ def _conormals(cloud, condition, rows, own, border) -> Float[Array, "m d"]:
         )
     assert border is not None
     return border.conormals(cloud)[place[rows]]
+
+
+# The sine of the angle that a conormal may be off the tangent plane: 3 degrees.
+_OFF = 0.05
+
+
+def _check_conormals(cloud, condition) -> None:
+    """Given conormals have to be tangent to the surface, and to lead out of it at its border."""
+    conormals, where = condition.conormals, condition.where
+    if conormals.shape[1] != cloud.dim:
+        raise ValueError(f"conormals have shape {conormals.shape}, expected (..., {cloud.dim})")
+    if not is_concrete(conormals, cloud.points, cloud.normals, cloud.boundary):
+        return
+    nu, normals = np.asarray(conormals), np.asarray(cloud.normals)[where]
+    normal = np.abs(np.einsum("md,md->m", nu, normals))
+    bad = np.flatnonzero(normal > _OFF)
+    if bad.size:
+        raise ValueError(
+            f"the conormal at point {where[bad[0]]} is not tangent to the surface: its normal part "
+            f"is {normal[bad[0]]:.3g}, expected at most {_OFF} ({bad.size} such points)"
+        )
+    if cloud.boundary is None:
+        return
+    at_border = np.flatnonzero(np.asarray(cloud.boundary)[where])
+    inside = inward(np.asarray(cloud.points), np.flatnonzero(cloud.host_active), where[at_border])
+    along = np.einsum("md,md->m", nu[at_border], inside)
+    bad = np.flatnonzero(along > 0.3 * np.linalg.norm(inside, axis=1))
+    if bad.size:
+        raise ValueError(
+            f"the conormal at point {where[at_border[bad[0]]]} leads into the surface, expected "
+            f"outward ({bad.size} such points)"
+        )
 
 
 def _free_neighbors(cloud, rows, free, neighbors, method) -> Neighbors:

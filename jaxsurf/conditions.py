@@ -2,18 +2,22 @@ r"""Boundary conditions $a\,u + b\,\partial_\nu u = g$, and whether several agre
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .arguments import is_concrete
+from .arguments import as_float, indices_of, instance, is_concrete, raise_at
 from .cloud import PointCloud
 
 Value = float | Float[Array, "*m"] | Callable[[Float[Array, ""]], Float[Array, "*m"]]
 Where = Bool[Array, " n"] | Int[Array, " m"] | Sequence[int]
+
+# Conormals are of length one to within this.
+_UNIT = 1e-5
 
 
 class Condition(eqx.Module):
@@ -26,6 +30,12 @@ class Condition(eqx.Module):
         a: factor of the value, scalar or `(m,)`; None if the points are free.
         b: factor of the conormal derivative, scalar or `(m,)`; None for a Dirichlet condition.
         conormals: outward conormals $\nu$, `(m, d)`; None to take those of the border.
+
+    Raises:
+        TypeError: points that are no mask nor indices, numbers that are not real, a function of
+            time that JAX cannot trace.
+        ValueError: shapes that do not fit, numbers that are not finite and conormals that are not
+            of length one (with the point), a point named twice, no point.
     """
 
     where: Int[np.ndarray, " m"]
@@ -33,24 +43,71 @@ class Condition(eqx.Module):
     a: Array | None
     b: Array | None
     conormals: Float[Array, "m d"] | None
+    of: int | None = eqx.field(static=True)
 
     def __init__(self, where, value, *, a, b, conormals=None):
-        self.where = _indices(where)
-        self.value = value if callable(value) else jnp.asarray(value)
-        self.a = None if a is None else jnp.asarray(a)
-        self.b = None if b is None else jnp.asarray(b)
-        self.conormals = None if conormals is None else jnp.asarray(conormals)
+        self.where = indices_of(where, None, "where")
+        self.of = len(where) if np.asarray(where).dtype == bool else None
+        self.value = value if callable(value) else as_float(value, "value")
+        self.a = None if a is None else as_float(a, "a")
+        self.b = None if b is None else as_float(b, "b")
+        self.conormals = None if conormals is None else as_float(conormals, "conormals")
 
     def __check_init__(self):
-        m = len(self.where)
-        for name in ("a", "b", "value"):
+        raise_at(self.where < 0, "where names point {v}: indices count from 0", self.where)
+        if not self.m and not self.is_free:
+            raise ValueError("where names no point: a condition needs at least 1")
+        for name in ("a", "b"):
             x = getattr(self, name)
-            if x is None or callable(x) or x.shape[:1] in ((), (m,)):
-                continue
-            raise ValueError(f"{name} has shape {x.shape}, the condition has {m} points")
-        if self.conormals is not None and self.conormals.shape[:1] != (m,):
+            if x is not None and x.shape not in ((), (self.m,)):
+                raise ValueError(f"{name} has shape {x.shape}, expected () or ({self.m},)")
+        if self.conormals is not None:
             shape = self.conormals.shape
-            raise ValueError(f"conormals have shape {shape}, the condition has {m} points")
+            if len(shape) != 2 or shape[0] != self.m or shape[1] not in (2, 3):
+                raise ValueError(f"conormals have shape {shape}, expected ({self.m}, d)")
+        self._check_value()
+        for name in ("a", "b", "conormals", "value"):
+            self._check_finite(name, getattr(self, name))
+        if self.conormals is not None and is_concrete(self.conormals):
+            with np.errstate(over="ignore"):
+                length = np.linalg.norm(np.asarray(self.conormals), axis=1)
+            off = np.flatnonzero(~(np.abs(length - 1) < _UNIT))
+            if off.size:
+                raise ValueError(
+                    f"the conormal at point {self.where[off[0]]} has length {length[off[0]]:.7g}, "
+                    f"expected 1 ({off.size} such points)"
+                )
+
+    def _check_value(self):
+        if not callable(self.value):
+            return self._check_shape(self.value.shape, "value")
+        try:
+            time = jax.ShapeDtypeStruct((), jnp.result_type(float))
+            found = jax.eval_shape(lambda t: jnp.asarray(self.value(t)), time)
+        except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+            raise TypeError(
+                "value is a function that JAX cannot trace: write it with jax.numpy, without "
+                "branches on the time"
+            ) from error
+        except TypeError as error:
+            raise TypeError(f"value has to be a function of time to an array: {error}") from error
+        if not jnp.issubdtype(found.dtype, jnp.floating) and found.dtype.kind not in "iub":
+            raise TypeError(f"value(t) is of type {found.dtype}, expected real numbers")
+        return self._check_shape(found.shape, "value(t)")
+
+    def _check_shape(self, shape, name):
+        if shape[:1] not in ((), (self.m,)):
+            m = self.m
+            raise ValueError(f"{name} has shape {shape}, expected (), ({m},) or ({m}, c)")
+
+    def _check_finite(self, name, x):
+        if x is None or callable(x) or not is_concrete(x):
+            return
+        good = np.isfinite(np.asarray(x))
+        if not good.all():
+            i = np.argmin(good.reshape(len(good), -1).all(axis=1)) if good.ndim else 0
+            value = np.asarray(x)[i] if good.ndim else x
+            raise ValueError(f"{name} is not finite at point {self.where[i]}: {value}")
 
     @property
     def m(self) -> int:
@@ -64,7 +121,24 @@ class Condition(eqx.Module):
 
     def at(self, t) -> Array:
         """The values g at a time."""
-        return jnp.asarray(self.value(t)) if callable(self.value) else self.value
+        return as_float(self.value(t), "value(t)") if callable(self.value) else self.value
+
+    def __repr__(self):
+        if self.is_free:
+            return f"free({self.m} points)"
+        what = "f(t)" if callable(self.value) else _told(self.value)
+        if self.b is None:
+            return f"dirichlet({self.m} points, value={what})"
+        own = "" if self.conormals is None else ", own conormals"
+        return f"robin({self.m} points, value={what}, a={_told(self.a)}, b={_told(self.b)}{own})"
+
+
+def _told(x) -> str:
+    """A number, or the range of several."""
+    if not is_concrete(x):
+        return f"traced{list(x.shape)}"
+    low, high = float(np.min(x)), float(np.max(x))
+    return f"{low:.4g}" if low == high else f"{low:.4g}..{high:.4g}"
 
 
 def dirichlet(where: Where, value: Value = 0.0) -> Condition:
@@ -176,15 +250,19 @@ def checked_conditions(
     cloud: PointCloud, conditions: Condition | Sequence[Condition]
 ) -> tuple[list[Condition], list[Bool[np.ndarray, " m"]]]:
     """The conditions, and which of their points each one decides: a point has one owner."""
-    conditions = [conditions] if isinstance(conditions, Condition) else list(conditions)
-    if not conditions:
-        raise ValueError("no conditions given")
+    instance(cloud, PointCloud, "cloud")
+    conditions = _listed(conditions)
     on = cloud.host_active
     owner, place = np.full(cloud.n, -1), np.zeros(cloud.n, int)
     owned = []
     for number, condition in enumerate(conditions):
         where = condition.where
-        outside = where[(where < 0) | (where >= cloud.n)]
+        if condition.of not in (None, cloud.n):
+            raise ValueError(
+                f"condition {number} is given by a mask of {condition.of} points, the cloud has "
+                f"{cloud.n}"
+            )
+        outside = where[where >= cloud.n]
         if outside.size:
             raise ValueError(f"condition {number} names point {outside[0]}, there are {cloud.n}")
         off = where[~on[where]]
@@ -198,6 +276,20 @@ def checked_conditions(
     if not np.any(on & ((owner < 0) | np.isin(owner, free))):
         raise ValueError(f"all {int(on.sum())} points are bound, no free point is left")
     return conditions, owned
+
+
+def _listed(conditions) -> list[Condition]:
+    hint = "made by js.dirichlet, js.neumann, js.robin or js.free"
+    if isinstance(conditions, Condition):
+        return [conditions]
+    if isinstance(conditions, str) or not isinstance(conditions, Iterable):
+        instance(conditions, Condition, "conditions", hint)
+    conditions = list(conditions)
+    if not conditions:
+        raise ValueError("conditions is empty, at least 1 condition is needed")
+    for number, condition in enumerate(conditions):
+        instance(condition, Condition, f"conditions[{number}]", hint)
+    return conditions
 
 
 def _check_agreement(conditions, number, owner, place) -> None:
@@ -242,17 +334,3 @@ def _differ(one: Condition, i, two: Condition, j) -> Bool[np.ndarray, " p"]:
         far = np.abs(x - y) > 1e-5 * (np.abs(x) + np.abs(y))
         result = result | far.reshape(len(i), -1).any(axis=1)
     return result
-
-
-def _indices(where) -> Int[np.ndarray, " m"]:
-    if not is_concrete(where):
-        raise ValueError("where must be concrete: which points are bound decides shapes")
-    where = np.asarray(where)
-    if where.dtype == bool and where.ndim == 1:
-        return np.flatnonzero(where).astype(np.int32)
-    if where.ndim != 1 or not (where.size == 0 or np.issubdtype(where.dtype, np.integer)):
-        raise ValueError(f"where is {where.dtype}{where.shape}, expected a mask or indices, 1-D")
-    unique, count = np.unique(where, return_counts=True)
-    if count.max(initial=1) > 1:
-        raise ValueError(f"point {unique[np.argmax(count)]} is named {count.max()} times")
-    return where.astype(np.int32)

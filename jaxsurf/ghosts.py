@@ -23,16 +23,19 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from .arguments import is_concrete
-from .borders import Border, find_border
+from .arguments import instance, is_concrete, real
+from .borders import Border, checked_border, find_border
 from .boundary import Closure, Source, check_pivots
 from .cloud import PointCloud
 from .conditions import Condition, checked_conditions
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod
 
-# An image closer than this share of the spacing to another point is left out.
-_CLOSE = 0.5
+# An image closer than this share of the spacing to another point is left out (not a half: on a
+# lattice the last bit would decide).
+_CLOSE = 0.49
+# Lengths that differ by less than this share are the same.
+_SAME = 1e-5
 
 
 def with_ghosts(
@@ -84,11 +87,13 @@ def with_ghosts(
         >>> bool(jnp.allclose(even, jnp.minimum(abs(x), 2 - abs(x)) ** 2))
         True
     """
+    instance(cloud, PointCloud, "cloud")
+    instance(method, AbstractMethod, "method", "as js.GFDM(degree=2)")
     if not is_concrete(cloud.points, cloud.normals, cloud.boundary, cloud.active):
         raise ValueError("with_ghosts needs concrete points: images are found on the host")
     conditions, owned = checked_conditions(cloud, conditions)
     with jax.ensure_compile_time_eval():  # of the points alone; values may be traced
-        border = find_border(cloud) if border is None else border
+        border = find_border(cloud) if border is None else checked_border(border, cloud)
     _check_places(conditions, owned, border)
     declared = np.zeros(cloud.n, bool)
     for condition in conditions:
@@ -145,6 +150,13 @@ class _Images:
         return second, parent, np.where(second, self.parent[parent], self.parent)
 
     @classmethod
+    def none(cls, points, r) -> _Images:
+        vectors, number, length = points[:0], np.zeros(0, int), np.zeros(0, points.dtype)
+        return cls(
+            vectors, vectors, number, length, number, number.reshape(0, r), length.reshape(0, r)
+        )
+
+    @classmethod
     def joined(cls, parts: list[_Images]) -> _Images:
         columns = zip(*(vars(part).values() for part in parts))
         return cls(*(np.concatenate(column) for column in columns))
@@ -165,8 +177,7 @@ def _reach(cloud, border, method, depth) -> Float[np.ndarray, " m"]:
     """How deep images reach, for every border point: as far as half its neighbours."""
     m = len(border.points)
     if depth is not None:
-        if not depth > 0:
-            raise ValueError(f"depth = {depth}, expected a positive length")
+        real(depth, "depth", above=0)
         return np.full(m, float(depth))
     on = cloud.host_active
     points = np.asarray(cloud.points, float)
@@ -220,16 +231,20 @@ class _Across:
         """Images of some points across one piece; with `corners`, of those beyond its ends."""
         spots = np.asarray(self.border.points)
         all_points = np.asarray(self.cloud.points)
-        distance, nearest = cKDTree(all_points[spots[piece]]).query(points)
+        distance, nearest = _nearest(all_points[spots[piece]], points)
         slot = piece[nearest]
-        near = (distance < self.reach[slot]) & ~np.isin(names, spots[piece])
+        near = (distance < (1 - _SAME) * self.reach[slot]) & ~np.isin(names, spots[piece])
         near &= self.owner[spots[slot]] >= 0
         if corners is not None:
             near &= np.isin(slot, corners)
         names, points, normals, slot = names[near], points[near], normals[near], slot[near]
         side = _sides(self.border, piece, slot)
-        found = self.border.at(self.cloud, side, slot, jnp.asarray(points))
-        foot, _, conormal, share = (np.asarray(x) for x in found)
+        if not len(slot):
+            return _Images.none(points, self.border.rows.shape[2])
+        # Filled up with copies, so that few shapes are ever compiled.
+        fill = np.arange(max(64, 1 << (len(slot) - 1).bit_length())) % len(slot)
+        found = self.border.at(self.cloud, side[fill], slot[fill], jnp.asarray(points[fill]))
+        foot, _, conormal, share = (np.asarray(x)[: len(slot)] for x in found)
         inside = -np.einsum("pd,pd->p", points - foot, conormal)
 
         row, used = (np.asarray(x)[side, slot] for x in (self.border.rows, self.border.mask))
@@ -238,7 +253,7 @@ class _Across:
         inner = row[np.arange(len(row)), np.argmax(beside, axis=1)]
         is_end = np.asarray(self.border.corners)[slot]
         past = np.einsum("pd,pd->p", foot - end, end - all_points[inner])
-        beyond = is_end & (past > 1e-9 * distance[near])
+        beyond = is_end & (past > np.finfo(points.dtype).eps ** 0.5 / 16 * distance[near])
         keep = inside > 1e-3 * distance[near]
         keep &= ~beyond if corners is None else beyond
 
@@ -254,6 +269,15 @@ class _Across:
         turned = normals - 2 * np.einsum("pd,pd->p", normals, conormal)[:, None] * conormal
         images = (points + step, turned, names, inside, condition, carriers, shares)
         return _Images(*(x[keep] for x in images))
+
+
+def _nearest(points, queries) -> tuple[Float[np.ndarray, " q"], Int[np.ndarray, " q"]]:
+    """Distance and number of the nearest point, of several equally near ones the first."""
+    count = min(4, len(points))
+    distance, near = cKDTree(points).query(queries, count)
+    distance, near = distance.reshape(-1, count), near.reshape(-1, count)
+    tied = distance <= (1 + _SAME) * distance[:, :1]
+    return distance[:, 0], np.where(tied, near, len(points)).min(axis=1)
 
 
 def _pieces(border: Border) -> list[Int[np.ndarray, " p"]]:
@@ -307,20 +331,22 @@ def _values(cloud, images, conditions, owned, place, throw):
     second, parent, root = images.ancestors(n)
 
     # u' = weight u + g / plus, with the conditions carried to the feet.
-    weight, inverse = jnp.zeros(m, dtype), jnp.zeros(m, dtype)
-    for number, condition in enumerate(conditions):
-        here = np.flatnonzero(images.condition == number)
-        pick, share = place[images.carriers[here]], images.shares[here]
-        a = _carried(condition.a, condition.m, pick, share).astype(dtype) / 2
-        b = 0 * a
-        if condition.b is not None:
-            b = _carried(condition.b, condition.m, pick, share) / (2 * images.distance[here])
-        if throw and is_concrete(a, b):
-            terms = np.asarray(abs(a) + abs(b))
-            check_pivots(np.asarray(a + b), terms, root[here], "image of point {i}: a/2 + b/2s")
-        weight = weight.at[here].set((b - a) / (a + b))
-        inverse = inverse.at[here].set(1 / (a + b))
-    total = jnp.where(second, weight * weight[parent], weight)
+    start = np.cumsum([0, *(c.m for c in conditions)])
+    a, b = (
+        jnp.concatenate([_each(x, c, dtype) for c, x in zip(conditions, xs)])
+        for xs in zip(*((c.a, c.b) for c in conditions))
+    )
+    pick = start[images.condition][:, None] + place[images.carriers]
+    a, b = _carried(a, b, pick, images.shares, images.distance)
+    total = jnp.where
+    if is_concrete(a, b):  # on the host, where new sizes compile nothing
+        a, b, total = np.asarray(a), np.asarray(b), np.where
+        if throw:
+            what = "image of point {i}: a/2 + b/2s"
+            check_pivots(a + b, abs(a) + abs(b), root, what)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight, inverse = (b - a) / (a + b), 1 / (a + b)
+        total = total(second, weight * weight[parent], weight)
 
     fixed = [c.where[own] if c.b is None else c.where[:0] for c, own in zip(conditions, owned)]
     rows = np.concatenate([*fixed, n + np.arange(m)])
@@ -330,7 +356,7 @@ def _values(cloud, images, conditions, owned, place, throw):
     for number, (condition, points) in enumerate(zip(conditions, fixed)):
         entries = _Entries(dtype)
         if len(points):
-            a = jnp.broadcast_to(condition.a, condition.m)[place[points]]
+            a = _on_host(jnp.broadcast_to(condition.a, condition.m))[place[points]]
             entries.add(start + np.arange(len(points)), 1 / a, place[points])
             bound[points] = number
             start += len(points)
@@ -344,20 +370,35 @@ def _values(cloud, images, conditions, owned, place, throw):
     for number, condition in enumerate(conditions):
         here = np.flatnonzero(bound[root] == number)
         if here.size:
-            a = jnp.broadcast_to(condition.a, condition.m)[place[root[here]]]
+            a = _on_host(jnp.broadcast_to(condition.a, condition.m))[place[root[here]]]
             sources[number].add(first + here, total[here] / a, place[root[here]])
     free = int(np.argmax(np.bincount(np.flatnonzero(bound < 0), minlength=n)))
     depends = np.where(bound[root] < 0, root, free)
-    total = jnp.where(bound[root] < 0, total, 0)
+    total = total * (bound[root] < 0)
 
     indices = jnp.asarray(np.concatenate([np.full(first, free), depends]).astype(np.int32))
-    weights = jnp.concatenate([jnp.zeros(first, dtype), total])
+    weights = _concatenated([np.zeros(first, dtype), total]).astype(dtype)
     given = tuple(entries.source(c) for entries, c in zip(sources, conditions) if entries.slots)
     return jnp.asarray(rows.astype(np.int32)), indices[None], weights[None], given
 
 
-def _carried(x, m: int, pick, share) -> Float[Array, " p"]:
-    return jnp.sum(share * jnp.broadcast_to(x, m)[pick], axis=1)
+def _on_host(x):
+    return np.asarray(x) if is_concrete(x) else x
+
+
+def _concatenated(parts) -> Array:
+    return jnp.asarray(np.concatenate(parts)) if is_concrete(*parts) else jnp.concatenate(parts)
+
+
+def _each(x, condition, dtype) -> Float[Array, " m"]:
+    """A factor at all points of a condition; none counts as zero."""
+    return jnp.broadcast_to(jnp.zeros((), dtype) if x is None else x.astype(dtype), condition.m)
+
+
+@jax.jit
+def _carried(a, b, pick, shares, distance):
+    """The terms a/2 and b/2s of all images."""
+    return tuple(jnp.sum(shares * x[pick], axis=1) / 2 / s for x, s in ((a, 1), (b, distance)))
 
 
 class _Entries:
@@ -371,7 +412,7 @@ class _Entries:
 
     def add(self, slots, factors, picks):
         self.slots.append(np.asarray(slots))
-        self.factors.append(jnp.asarray(factors, self.dtype))
+        self.factors.append(factors)
         self.picks.append(np.asarray(picks))
 
     def add_carried(self, images, place, slots, factors, which):
@@ -382,7 +423,7 @@ class _Entries:
 
     def source(self, condition) -> Source:
         slots, picks = (jnp.asarray(np.concatenate(x)) for x in (self.slots, self.picks))
-        return Source(slots, jnp.concatenate(self.factors), picks, condition)
+        return Source(slots, _concatenated(self.factors).astype(self.dtype), picks, condition)
 
 
 def _joined(cloud, images, border) -> PointCloud:

@@ -488,7 +488,7 @@ def test_bad_conditions():
         ([js.dirichlet(border), js.neumann(border[-1:])], f"point {border[-1]} is bound"),
         (js.neumann(inner[:1]), f"no conormal at point {inner[0]}"),
         (js.dirichlet([90]), "names point 90, there are 81"),
-        ([], "no conditions"),
+        ([], "conditions is empty"),
         (js.dirichlet(np.ones(81, bool)), "all 81 points are bound"),
         (js.robin(border, a=-1e9, b=0.0), None),
         (js.robin(border, a=0.0, b=0.0), "does not determine the value at point"),
@@ -501,11 +501,11 @@ def test_bad_conditions():
             js.close(cloud, conditions)
     same = js.close(cloud, [js.dirichlet(border, 1.0), js.dirichlet(border[3:], 1.0)])
     assert same.m == len(border)
-    with pytest.raises(ValueError, match="named 2 times"):
+    with pytest.raises(ValueError, match="where names point 3 2 times"):
         js.dirichlet([3, 3])
     with pytest.raises(ValueError, match="value has shape"):
         js.dirichlet([3, 4], jnp.zeros(3))
-    with pytest.raises(ValueError, match="must be concrete"):
+    with pytest.raises(TypeError, match="must be concrete"):
         jax.jit(lambda m: js.dirichlet(m).m)(cloud.boundary)
     with pytest.raises(ValueError, match="no point is marked"):
         js.find_border(js.sphere(50))

@@ -79,11 +79,12 @@ class Condition(eqx.Module):
                 )
 
     def _check_value(self):
-        if not callable(self.value):
-            return self._check_shape(self.value.shape, "value")
+        value = self.value
+        if not callable(value):
+            return self._check_shape(value.shape, "value")
         try:
             time = jax.ShapeDtypeStruct((), jnp.result_type(float))
-            found = jax.eval_shape(lambda t: jnp.asarray(self.value(t)), time)
+            found = jax.eval_shape(lambda t: jnp.asarray(value(t)), time)
         except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
             raise TypeError(
                 "value is a function that JAX cannot trace: write it with jax.numpy, without "

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import compress
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -330,23 +331,9 @@ def _values(cloud, images, conditions, owned, place, throw):
     n, m, dtype = cloud.n, len(images.parent), cloud.points.dtype
     second, parent, root = images.ancestors(n)
 
-    # u' = weight u + g / plus, with the conditions carried to the feet.
-    start = np.cumsum([0, *(c.m for c in conditions)])
-    a, b = (
-        jnp.concatenate([_each(x, c, dtype) for c, x in zip(conditions, xs)])
-        for xs in zip(*((c.a, c.b) for c in conditions))
-    )
-    pick = start[images.condition][:, None] + place[images.carriers]
-    a, b = _carried(a, b, pick, images.shares, images.distance)
-    total = jnp.where
-    if is_concrete(a, b):  # on the host, where new sizes compile nothing
-        a, b, total = np.asarray(a), np.asarray(b), np.where
-        if throw:
-            what = "image of point {i}: a/2 + b/2s"
-            check_pivots(a + b, abs(a) + abs(b), root, what)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        weight, inverse = (b - a) / (a + b), 1 / (a + b)
-        total = total(second, weight * weight[parent], weight)
+    weight, inverse = _factors(images, conditions, place, root, dtype, throw)
+    chosen = np.where if is_concrete(weight) else jnp.where
+    total = chosen(second, weight * weight[parent], weight)
 
     fixed = [c.where[own] if c.b is None else c.where[:0] for c, own in zip(conditions, owned)]
     rows = np.concatenate([*fixed, n + np.arange(m)])
@@ -382,7 +369,23 @@ def _values(cloud, images, conditions, owned, place, throw):
     return jnp.asarray(rows.astype(np.int32)), indices[None], weights[None], given
 
 
-def _on_host(x):
+def _factors(images, conditions, place, root, dtype, throw) -> Any:
+    """The value of an image is `weight` u + `inverse` g; conditions are carried to the feet."""
+    start = np.cumsum([0, *(c.m for c in conditions)])
+    pick = start[images.condition][:, None] + place[images.carriers]
+    every = [
+        jnp.concatenate([_each(x, c, dtype) for c, x in zip(conditions, xs)])
+        for xs in zip(*((c.a, c.b) for c in conditions))
+    ]
+    a, b = map(_on_host, _carried(*every, pick, images.shares, images.distance))
+    if throw and is_concrete(a, b):
+        check_pivots(a + b, abs(a) + abs(b), root, "image of point {i}: a/2 + b/2s")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (b - a) / (a + b), 1 / (a + b)
+
+
+def _on_host(x) -> Any:
+    """Where it is concrete: new sizes compile nothing there."""
     return np.asarray(x) if is_concrete(x) else x
 
 

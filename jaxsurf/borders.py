@@ -47,7 +47,8 @@ class Border(eqx.Module):
     rows: Int[Array, "2 m r"]
     mask: Bool[Array, "2 m r"]
 
-    def __check_init__(self):
+    def __init__(self, points, rows, mask):
+        self.points, self.rows, self.mask = points, rows, mask
         m, shape = np.shape(self.points), np.shape(self.rows)
         if len(m) != 1 or not m[0]:
             raise ValueError(f"points has shape {m}, expected (m,) with at least 1 point")

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Real
 
 from .arguments import as_float, instance, is_concrete, raise_at, real, whole
 from .borders import Border, checked_border, find_border, inward
@@ -81,11 +81,13 @@ class Closure(eqx.Module):
     rows: Int[Array, " m"]
     indices: Int[Array, "k m"]
     weights: Float[Array, "k m"]
-    sources: tuple[Source, ...] = ()
-    declared: Bool[Array, " n"] | None = None
+    sources: tuple[Source, ...]
+    declared: Bool[Array, " n"] | None
 
-    def __check_init__(self):
-        whole(self.n, "n", least=1)
+    def __init__(self, n, rows, indices, weights, sources=(), declared=None):
+        self.n = whole(n, "n", least=1)
+        self.rows, self.indices, self.weights = rows, indices, weights
+        self.sources, self.declared = sources, declared
         k, m = np.shape(self.indices)[:1], np.shape(self.rows)
         wanted = {"rows": m[:1], "indices": (*k, *m), "weights": (*k, *m), "declared": (self.n,)}
         for name, shape in wanted.items():
@@ -115,7 +117,7 @@ class Closure(eqx.Module):
         """True at bound points."""
         return jnp.zeros(self.n, bool).at[self.rows].set(True)
 
-    def __call__(self, u: Float[Array, "n *c"], t=0.0) -> Float[Array, "n *c"]:
+    def __call__(self, u: Real[Array, "n *c"], t=0.0) -> Float[Array, "n *c"]:
         """The field with its bound values replaced by those that follow at time t.
 
         Args:

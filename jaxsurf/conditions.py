@@ -8,12 +8,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Real
 
 from .arguments import as_float, indices_of, instance, is_concrete, raise_at
 from .cloud import PointCloud
 
-Value = float | Float[Array, "*m"] | Callable[[Float[Array, ""]], Float[Array, "*m"]]
+Value = (
+    float | Real[Array, "*m"] | Sequence[float] | Callable[[Float[Array, ""]], Real[Array, "*m"]]
+)
 Where = Bool[Array, " n"] | Int[Array, " m"] | Sequence[int]
 
 # Conormals are of length one to within this.

@@ -225,7 +225,7 @@ def test_a_border_about_which_nothing_is_said():
         laplacian,
         laplacian.scaled(2.0).shifted(1.0),
         laplacian.transpose(),
-        js.directional_derivative(cloud, jnp.ones(3), neighbors=near, method=method),
+        js.directional_derivative(cloud, jnp.ones((cloud.n, 3)), neighbors=near, method=method),
         js.diffusion(cloud, jnp.ones(cloud.n), neighbors=near, method=method),
         js.surface_divergence(cloud, near, method=method) @ gradient,
         js.Stencil(laplacian.indices, laplacian.weights) @ laplacian,

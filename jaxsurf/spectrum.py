@@ -280,6 +280,7 @@ def _scaled(operator: AbstractOperator) -> tuple[Callable, float]:
         (outer, one), (inner, other) = _scaled(operator.outer), _scaled(operator.inner)
         return lambda v: outer(inner(v)), one * other
     matrix = operator.to_scipy().tocsr().astype(float)
+    matrix.sum_duplicates()
     bad = np.repeat(np.arange(operator.n), np.diff(matrix.indptr))[~np.isfinite(matrix.data)]
     if bad.size:
         raise ValueError(f"operator has weights that are not finite at point {bad[0]}")

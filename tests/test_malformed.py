@@ -2,10 +2,18 @@
 
 import importlib
 import pkgutil
+from collections import Counter
 
 import pytest
 
+import jaxsurf as js
+
 from . import malformed
+
+# What functions return or raise, and classes to be filled out by users.
+MADE_FOR_USERS = {"Diagnostics", "Eigenmodes", "IntegrationError", "Spectrum"} | {
+    name for name in vars(js) if name.startswith("Abstract")
+}
 
 CASES = [
     case
@@ -29,3 +37,21 @@ def test_malformed(case):
 def test_no_case_twice():
     names = [case.id for case in CASES]
     assert len(set(names)) == len(names)
+
+
+PUBLIC = sorted(name for name, value in vars(js).items() if callable(value))
+# Turned on when all parts have their cases.
+WHOLE = False
+
+
+def test_cases_are_about_public_names():
+    strange = {case.function for case in CASES if case.function.split(".")[0] not in PUBLIC}
+    assert not strange, f"not exported: {strange}"
+
+
+def test_no_public_name_is_left_out():
+    """Three cases at least for each that takes arguments from users."""
+    have = Counter(case.function.split(".")[0] for case in CASES)
+    few = {name: have[name] for name in PUBLIC if have[name] < 3 and name not in MADE_FOR_USERS}
+    assert not (WHOLE and few), f"fewer than three cases: {few}"
+    assert not WHOLE or len(CASES) >= 300

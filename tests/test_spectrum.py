@@ -3,7 +3,6 @@
 import functools
 import warnings
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,7 +10,9 @@ import scipy.sparse
 
 import jaxsurf as js
 
-from .helpers import METHODS, jittered_sphere, label
+from .helpers import METHODS, count_compilations, jittered_sphere, label
+
+N = 400
 
 
 class Matrix(js.AbstractOperator):
@@ -34,13 +35,19 @@ class Matrix(js.AbstractOperator):
 
 
 @functools.cache
-def laplacian(n=500):
-    return js.laplace_beltrami(js.sphere(n))
+def laplacian():
+    return js.laplace_beltrami(js.sphere(N))
 
 
+@functools.cache
 def growing():
     """One row with the wrong sign: an eigenvalue of +74 beside a radius of 100."""
-    return laplacian().scaled(jnp.ones(500).at[100].set(-1.0))
+    return laplacian().scaled(jnp.ones(N).at[100].set(-1.0))
+
+
+@functools.cache
+def exact_growing():
+    return np.linalg.eigvals(growing().to_scipy().toarray())
 
 
 def check(operator, *, rtol=1e-8, exact=None, **settings):
@@ -59,32 +66,31 @@ def check(operator, *, rtol=1e-8, exact=None, **settings):
 
 @pytest.mark.parametrize("method", METHODS, ids=label)
 def test_stable_operators(method):
-    operator = js.laplace_beltrami(jittered_sphere(500), method=method)
+    operator = js.laplace_beltrami(jittered_sphere(N), method=method)
     estimate = check(operator)
     assert abs(estimate.abscissa) < 1e-10 * estimate.radius
 
 
 @pytest.mark.parametrize("steps", [10, 20, 40, 60, 80, 120])
 def test_a_growing_mode_is_found(steps):
-    worse = growing()
-    exact = np.linalg.eigvals(worse.to_scipy().toarray()).real.max()
+    exact = exact_growing().real.max()
     assert exact > 10
-    found = js.spectral_estimate(worse, steps=steps)
+    found = js.spectral_estimate(growing(), steps=steps)
     np.testing.assert_allclose(found.abscissa, exact, rtol=1e-7)
 
 
 @pytest.mark.parametrize("degree", [1, 6, 60])
 def test_any_degree_serves(degree):
-    check(growing(), degree=degree)
+    check(growing(), degree=degree, exact=exact_growing())
 
 
 def test_perturbed_and_permuted():
     """Nothing hangs on the last bit, or on the order of a sum."""
     matrix = growing().to_scipy().toarray()
-    exact = np.linalg.eigvals(matrix)
+    exact = exact_growing()
     rng = np.random.default_rng(5)
     for steps in (20, 40, 60, 80, 120):
-        order = rng.permutation(500)
+        order = rng.permutation(N)
         turned = matrix[order][:, order] * (1 + 1e-15 * rng.normal(size=matrix.shape))
         check(Matrix(turned), exact=exact, steps=steps)
 
@@ -101,14 +107,14 @@ def test_growing_modes_of_every_size_in_skew_bases(growth):
 
 @pytest.mark.parametrize("shift", [1e-5, 1e-2, 1.0, 1e3])
 def test_one_point_that_grows(shift):
-    found = check(laplacian().shifted(jnp.zeros(500).at[100].set(shift)))
+    found = check(laplacian().shifted(jnp.zeros(N).at[100].set(shift)))
     assert found.abscissa > 0
 
 
 @pytest.mark.parametrize("factor", [0.0, -1e-4, -1e-2])
 def test_values_that_are_held(factor):
     """Half of the rows are zero, and one of the others may make a mode that grows."""
-    z = js.sphere(500).points[:, 2]
+    z = js.sphere(N).points[:, 2]
     rows = jnp.where(z > 0, 1.0, 0.0).at[jnp.argmax(z)].multiply(factor if factor else 1)
     check(laplacian().scaled(rows))
 
@@ -132,7 +138,7 @@ def test_waves(growth):
 
 
 def test_many_eigenvalues_of_one_real_part_are_told():
-    frequency = np.linspace(0, 1000, 550)
+    frequency = np.linspace(0, 1000, 510)
     off = scipy.sparse.diags(frequency)
     matrix = scipy.sparse.bmat([[None, off], [-off, None]]).toarray()
     with pytest.warns(UserWarning, match=r"abscissa .* residual of .* steps = 40"):
@@ -175,7 +181,7 @@ def test_single_precision():
 
 
 def test_compositions_and_components():
-    cloud = js.sphere(400)
+    cloud = js.sphere(N)
     check(js.biharmonic(cloud))
     with pytest.raises(ValueError, match=r"not from \(\) to \(3,\) components"):
         js.spectral_estimate(js.surface_gradient(cloud))
@@ -183,11 +189,6 @@ def test_compositions_and_components():
 
 def test_nothing_is_compiled():
     operator = laplacian()
-    with jax.log_compiles(), warnings.catch_warnings():
-        warnings.simplefilter("error")
-        jax.clear_caches()
+    with count_compilations() as names:
         js.spectral_estimate(operator)
-        with pytest.raises(TypeError, match="traced"):
-            jax.jit(lambda w: js.spectral_estimate(js.Stencil(operator.indices, w)).radius)(
-                operator.weights
-            )
+    assert names == []

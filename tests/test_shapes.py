@@ -252,7 +252,7 @@ def test_level_set_refuses_bad_input():
         level_set(sphere_phi, n=100, spacing=0.1, bounds=box)
     with pytest.raises(ValueError, match="n = 2 points, needs at least 4"):
         level_set(sphere_phi, n=2, bounds=box)
-    with pytest.raises(ValueError, match="spacing is -1"):
+    with pytest.raises(ValueError, match="spacing = -1, expected above 0"):
         level_set(sphere_phi, spacing=-1, bounds=box)
     with pytest.raises(ValueError, match="must exceed lower corner"):
         level_set(sphere_phi, n=100, bounds=((1.0,) * 3, (0.0,) * 3))
@@ -267,7 +267,7 @@ def test_makers_refuse_bad_input():
         sphere(3)
     with pytest.raises(ValueError, match="n = 2 points, needs at least 3"):
         circle(2)
-    with pytest.raises(ValueError, match="radius is 0"):
+    with pytest.raises(ValueError, match="radius = 0, expected above 0"):
         sphere(10, radius=0)
     with pytest.raises(ValueError, match="axis 1 is -2"):
         ellipsoid(100, (1, -2, 3))
@@ -281,7 +281,9 @@ def test_makers_refuse_bad_input():
         surface_of_revolution(lambda s: (jnp.abs(s - 0.5), s), 300)
     with pytest.raises(ValueError, match="2 points in each of 5 rows"):
         graph(lambda x, y: x, (2, 5))
-    with pytest.raises(ValueError, match=r"thickness is 0\.1"):
+    with pytest.raises(
+        ValueError, match=r"thickness = 0\.1, expected at least 0\.3 and at most 0\.55"
+    ):
         double_torus(0.1)
 
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsurf.arguments import raise_at
+from jaxsurf.arguments import differentiable, in_range, is_concrete, on_host, raise_at, real, whole
 from jaxsurf.cloud import PointCloud
+from jaxsurf.functions import Traced, canonical
 from jaxsurf.shapes.order import sort_points
-from jaxsurf.shapes.sampling import Project, ideal_spacing, relax
+from jaxsurf.shapes.sampling import MOST, Project, ideal_spacing, in_blocks, relax
 
 # Successive angles at this distance never line up, whatever their number.
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
@@ -88,6 +91,7 @@ def ellipsoid(n: int, axes: tuple[float, float, float], *, steps: int = 30) -> P
     """
     _check_count(n, 4)
     semi = _checked_axes(axes)
+    whole(steps, "steps", least=0)
     sphere_points, area = _equal_area_ellipsoid(n, semi)
     points, normals = relax(
         sphere_points * semi,
@@ -122,8 +126,10 @@ def torus(n: int, R: float, r: float) -> PointCloud:
     _check_positive("R", R)
     if not r < R:
         raise ValueError(f"tube radius r = {r} must be less than R = {R}")
+    # Arrays, not constants of the program: other radii run what is compiled.
+    centre, tube = jnp.asarray(float(R)), jnp.asarray(float(r))
     return surface_of_revolution(
-        lambda s: (R + r * jnp.cos(s), r * jnp.sin(s)), n, interval=(0.0, 2 * np.pi)
+        lambda s: (centre + tube * jnp.cos(s), tube * jnp.sin(s)), n, interval=(0.0, 2 * np.pi)
     )
 
 
@@ -161,19 +167,17 @@ def surface_of_revolution(
         (2000, True, True)
     """
     _check_count(n, 12)
-    start, stop = map(float, interval)
-    if not stop > start:
-        raise ValueError(f"interval {interval} is empty")
-
-    def along(s):
-        s = jnp.asarray(s)
-        point, slope = jax.vmap(
-            lambda t: jax.jvp(lambda v: jnp.stack(profile(v)), (t,), (jnp.ones_like(t),))
-        )(s)
-        return np.asarray(point, float), np.asarray(slope, float)
+    start, stop = _interval(interval)
+    dtype = jnp.result_type(float)
+    found = differentiable(profile, "profile", jax.ShapeDtypeStruct((), dtype))
+    if not (isinstance(found, tuple | list) and [np.shape(a) for a in found] == [(), ()]):
+        raise TypeError("profile must return two numbers, radius and z, for one number")
+    program = canonical(profile, jnp.zeros((), dtype))
+    along = in_blocks(partial(_curve, program), dtype)
 
     table = np.linspace(start, stop, _TABLE)
-    curve, tangent = along(table)
+    curve, tangent = (np.asarray(a, float) for a in along(table))
+    in_range(curve, "profile")
     radius, speed = curve[:, 0], np.linalg.norm(tangent, axis=1)
     tiny = 1e3 * float(jnp.finfo(jnp.result_type(float)).eps) * np.abs(curve).max()
     inside = slice(1, -1)
@@ -194,7 +198,7 @@ def surface_of_revolution(
     rings = max(round(length[-1] / spacing + halves), 2)
     place = np.arange(rings) + (0.0 if border[0] else 0.5)
     s = np.interp(place / (rings - halves) * length[-1], length, table)
-    ring, slope = along(s)
+    ring, slope = (np.asarray(a, float) for a in along(s))
     counts = _shares(ring[:, 0], n)
 
     row = np.repeat(np.arange(rings), counts)
@@ -237,11 +241,21 @@ def graph(
         >>> bump.n, int(bump.boundary.sum()), bool((bump.normals[:, 2] > 0).all())
         (600, 96, True)
     """
-    (x0, y0), (x1, y1) = bounds
+    box = in_range(on_host(bounds, "bounds"), "bounds")
+    if box.shape != (2, 2):
+        raise ValueError(f"bounds must be two corners in the plane, shape (2, 2), not {box.shape}")
+    (x0, y0), (x1, y1) = box
     if not (x1 > x0 and y1 > y0):
         raise ValueError(f"upper corner {bounds[1]} must exceed lower corner {bounds[0]}")
-    if isinstance(n, tuple):
-        counts = np.full(n[1], n[0])
+    dtype = jnp.result_type(float)
+    number = jax.ShapeDtypeStruct((), dtype)
+    found = differentiable(f, "f", number, number)
+    if getattr(found, "shape", None) != ():
+        raise TypeError("f must return one number, the height, for two numbers")
+    if isinstance(n, tuple | list):
+        if len(n) != 2:
+            raise ValueError(f"n = {n} has {len(n)} numbers, expected 2: (nx, ny)")
+        counts = np.full(whole(n[1], "n", least=0), whole(n[0], "n", least=0))
     else:
         _check_count(n, 9)
         wide, high = x1 - x0, y1 - y0
@@ -249,19 +263,48 @@ def graph(
         gaps = (-(wide + high) + np.sqrt((wide - high) ** 2 + 4 * n * wide * high)) / 2
         rows = max(round(gaps / wide) + 1, 3)
         counts = np.diff(np.arange(rows + 1) * n // rows)
-    if len(counts) < 3 or counts.min() < 3:
-        raise ValueError(
-            f"{counts.min()} points in each of {len(counts)} rows, needs at least 3 in 3"
-        )
+    fewest = counts.min(initial=MOST) if len(counts) else 0
+    if len(counts) < 3 or fewest < 3:
+        raise ValueError(f"{fewest} points in each of {len(counts)} rows, needs at least 3 in 3")
     row = np.repeat(np.arange(len(counts)), counts)
     within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     x = x0 + (x1 - x0) * within / (counts[row] - 1)
     y = y0 + (y1 - y0) * row / (len(counts) - 1)
-    z, slopes = jax.vmap(jax.value_and_grad(f, argnums=(0, 1)))(jnp.asarray(x), jnp.asarray(y))
-    normals = np.stack([-np.asarray(slopes[0]), -np.asarray(slopes[1]), np.ones(len(x))], axis=1)
+    program = canonical(f, jnp.zeros((), dtype), jnp.zeros((), dtype))
+    heights = in_blocks(partial(_height, program), dtype)(np.stack([x, y], axis=1))
+    z, x_slope, y_slope = (np.asarray(a, float) for a in heights)
+    bad = ~(np.isfinite(z) & np.isfinite(x_slope) & np.isfinite(y_slope))
+    raise_at(bad, "f or its slope is not finite at (x, y) = {v}", np.stack([x, y], axis=1))
+    normals = np.stack([-x_slope, -y_slope, np.ones(len(x))], axis=1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     boundary = (row == 0) | (row == row[-1]) | (within == 0) | (within == counts[row] - 1)
     return _sorted_cloud(np.stack([x, y, np.asarray(z)], axis=1), normals, boundary)
+
+
+@eqx.filter_jit
+def _curve(profile: Traced, s):
+    """Points of a profile and its slopes."""
+
+    def single(t):
+        return jax.jvp(lambda v: jnp.stack(profile(v)), (t,), (jnp.ones_like(t),))
+
+    return jax.vmap(single)(s)
+
+
+@eqx.filter_jit
+def _height(f: Traced, points):
+    """Height of a graph and its slopes."""
+    z, (x_slope, y_slope) = jax.vmap(jax.value_and_grad(f, argnums=(0, 1)))(*points.T)
+    return z, x_slope, y_slope
+
+
+def _interval(interval) -> tuple[float, float]:
+    ends = on_host(interval, "interval")
+    if ends.shape != (2,) or not np.isfinite(ends).all():
+        raise ValueError(f"interval is {interval}, expected two finite numbers")
+    if not ends[1] > ends[0]:
+        raise ValueError(f"interval {interval} is empty")
+    return float(ends[0]), float(ends[1])
 
 
 def sphere_projection(radius: float = 1.0) -> Project:
@@ -348,7 +391,8 @@ def _equal_area_ellipsoid(n: int, semi: np.ndarray) -> tuple[np.ndarray, float]:
     of the ring at z.
     """
     # About the axis across which the ellipsoid is roundest, to shear the lattice least.
-    ratios = [abs(np.log(np.divide(*np.delete(semi, axis)))) for axis in range(3)]
+    # (Ratios that are equal up to round-off are a tie.)
+    ratios = [abs(np.log(np.divide(*np.delete(semi, axis)))).round(9) for axis in range(3)]
     turn = (int(np.argmin(ratios)) + 1 + np.arange(3)) % 3
     a, b, c = semi[turn]
     z = np.linspace(-1, 1, 1_025)
@@ -387,7 +431,9 @@ def _shares(lengths: np.ndarray, n: int) -> np.ndarray:
     """n points shared among rings in proportion to their lengths, at least three to each."""
     if n < 3 * len(lengths):
         raise ValueError(f"n = {n} points, needs at least {3 * len(lengths)}: three on each ring")
-    counts = np.maximum(np.rint(n * lengths / lengths.sum()).astype(int), 3)
+    # Halves that are equal up to round-off are rounded the same way.
+    shares = np.round(n * (lengths / lengths.sum()), 9)
+    counts = np.maximum(np.rint(shares).astype(int), 3)
     # What rounding left over goes to the rings on which one point matters least.
     while (left := n - counts.sum()) != 0:
         most = np.argsort(-counts, kind="stable")[: abs(left)]
@@ -407,18 +453,21 @@ def _sorted_cloud(
 
 
 def _check_count(n: int, least: int) -> None:
-    if n < least:
+    if whole(n, "n", most=MOST) < least:
         raise ValueError(f"n = {n} points, needs at least {least}")
 
 
 def _check_positive(name: str, value: float) -> None:
-    if not (np.isfinite(value) and value > 0):
-        raise ValueError(f"{name} is {value}, expected a positive number")
+    real(value, name, above=0)
+    in_range(value, name)
+    if not is_concrete(value):
+        raise TypeError(f"{name} must be concrete: points are chosen outside jit and grad")
 
 
 def _checked_axes(axes: tuple[float, float, float]) -> np.ndarray:
-    semi = np.asarray(axes, float)
+    semi = on_host(axes, "axes")
     if semi.shape != (3,):
         raise ValueError(f"axes must be three numbers, not shape {semi.shape}")
     raise_at(~(np.isfinite(semi) & (semi > 0)), "axis {i} is {v}, expected a positive number", semi)
+    in_range(semi, "axes")
     return semi

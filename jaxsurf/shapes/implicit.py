@@ -8,6 +8,7 @@ and derivatives with respect to everything that `phi` depends on follow.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -17,17 +18,27 @@ from jax import lax
 from jaxtyping import Array, Float
 from scipy import ndimage
 
-from jaxsurf.arguments import is_concrete, raise_at
+from jaxsurf.arguments import (
+    as_float,
+    differentiable,
+    finite,
+    in_range,
+    is_concrete,
+    on_host,
+    raise_at,
+    real,
+    whole,
+)
 from jaxsurf.cloud import PointCloud
+from jaxsurf.functions import Traced, canonical
 from jaxsurf.shapes.order import sort_points
-from jaxsurf.shapes.sampling import Project, quasi_uniform
+from jaxsurf.shapes.sampling import MOST, in_blocks, points_at, quasi_uniform
 
 LevelSet = Callable[[Float[Array, " d"]], Float[Array, ""]]
 Bounds = tuple[tuple[float, ...], tuple[float, ...]]
 
-# Rows handed to a compiled function at a time: one shape, hence one compilation, for the grid,
-# the candidates and the relaxed points alike.
-_CHUNK = 16_384
+# Newton steps along a ray at most, and how many widths of the band a candidate may stray.
+_STEPS, _STRAY = 30, 10
 
 
 def level_set(
@@ -76,41 +87,41 @@ def level_set(
     dim = box.shape[1]
     if (n is None) == (spacing is None):
         raise ValueError("give exactly one of n and spacing")
-    if spacing is not None and not spacing > 0:
-        raise ValueError(f"spacing is {spacing}, expected a positive number")
-    if n is not None and n < 4:
+    whole(resolution, "resolution", least=4, most=1_000)
+    whole(seed, "seed", least=0)
+    if steps is not None:
+        whole(steps, "steps", least=0)
+    if spacing is not None:
+        real(spacing, "spacing", above=0)
+    elif whole(n, "n", most=MOST) < 4:
         raise ValueError(f"n = {n} points, needs at least 4")
-    if resolution < 4:
-        raise ValueError(f"resolution = {resolution} cells, needs at least 4")
     dtype = jnp.result_type(float)
+    program = _program(phi, jax.ShapeDtypeStruct((dim,), dtype))
+    look = in_blocks(partial(_values_and_gradients, program), dtype)
 
-    def onto(points):
-        found = project_to_level_set(phi, points, throw=False)
-        return found, level_set_normals(phi, found)
-
-    values = _in_chunks(jax.jit(jax.vmap(phi)), dtype)
-    project: Project = _in_chunks(jax.jit(onto), dtype)
-
-    cells, size = _crossed_cells(values, box, resolution)
+    cells, size = _crossed_cells(look, box, resolution)
     if n is None:
-        measure = _candidates(project, cells, size, box, 50_000, seed)[2]
-        n = round(measure / spacing ** (dim - 1))  # type: ignore[operator]
+        measure = _candidates(look, cells, size, box, 50_000, seed)[2]
+        n = points_at(spacing, measure, dim=dim)  # type: ignore[arg-type]
         if n < 4:
             raise ValueError(f"spacing = {spacing} gives n = {n} points, needs at least 4")
-    candidates, normals, measure = _candidates(project, cells, size, box, max(6 * n, 5_000), seed)
+    candidates, normals, measure = _candidates(look, cells, size, box, max(6 * n, 5_000), seed)
     if len(candidates) < n:
         raise ValueError(f"only {len(candidates)} candidates for n = {n} points: finer resolution?")
+    # Between steps of relaxation points need not be closer to the surface than this.
+    rough = 1e-3 * (measure / n) ** (1 / (dim - 1))
     points, _ = quasi_uniform(
         candidates,
         n,
-        project,
+        lambda x: _onto(look, x, rough),
         measure=measure,
         normals=normals,
         steps=steps if steps is not None else (40 if dim == 3 else 200),
         seed=seed,
     )
-    points = points[sort_points(points)]
-    return PointCloud(jnp.asarray(points), level_set_normals(phi, jnp.asarray(points)))
+    points = _onto(look, points)[0]
+    chosen = jnp.asarray(points[sort_points(points)])
+    return PointCloud(chosen, level_set_normals(phi, chosen))
 
 
 def project_to_level_set(
@@ -151,18 +162,31 @@ def project_to_level_set(
         >>> bool(jnp.isclose(jax.grad(height)(1.0), 0.8))
         True
     """
-    points = jnp.asarray(points)
-    eps = float(jnp.finfo(points.dtype).eps)
+    points = _checked_points(points)
+    whole(max_steps, "max_steps", least=1)
     if tolerance is None:
+        eps = float(jnp.finfo(points.dtype).eps)
         limit = eps ** (2 / 3) * jnp.max(jnp.abs(lax.stop_gradient(points)), initial=eps)
     else:
-        limit = jnp.asarray(tolerance, points.dtype)
+        limit = jnp.asarray(real(tolerance, "tolerance", above=0), points.dtype)
+    program = _program(phi, points[0] if len(points) else jnp.zeros(points.shape[1:]))
+    found, step = _projected(program, points, limit, jnp.asarray(max_steps))
+    if throw and is_concrete(found, step):
+        step = np.abs(np.asarray(step))
+        raise_at(
+            ~(step <= np.asarray(limit)),
+            f"projection of point {{i}} did not converge: last step {{v}}, tolerance {limit:.2g}, "
+            f"{max_steps} steps (too far from the level set, or the gradient vanishes)",
+            step,
+        )
+    return found
+
+
+@eqx.filter_jit
+def _projected(phi: Traced, points, limit, max_steps):
     # The loop must not see tangents, also not those of parameters that phi has captured: reverse
-    # mode cannot go through it. So phi is opened up and its captured values are frozen too.
-    frozen = jax.tree.map(
-        lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf,
-        eqx.filter_closure_convert(phi, jax.ShapeDtypeStruct(points.shape[1:], points.dtype)),
-    )
+    # mode cannot go through it.
+    frozen = jax.tree.map(lax.stop_gradient, phi)
 
     def single(start):
         g = jax.grad(phi)(start)
@@ -178,16 +202,7 @@ def project_to_level_set(
         good = jnp.abs(step) <= limit
         return jnp.where(good, start + t * g, jnp.nan), step
 
-    found, step = jax.vmap(single)(points)
-    if throw and is_concrete(found, step):
-        step = np.abs(np.asarray(step))
-        raise_at(
-            ~(step <= np.asarray(limit)),
-            f"projection of point {{i}} did not converge: last step {{v}}, tolerance {limit:.2g}, "
-            f"{max_steps} steps (too far from the level set, or the gradient vanishes)",
-            step,
-        )
-    return found
+    return jax.vmap(single)(points)
 
 
 def level_set_normals(phi: LevelSet, points: Float[Array, "n d"]) -> Float[Array, "n d"]:
@@ -208,13 +223,13 @@ def level_set_normals(phi: LevelSet, points: Float[Array, "n d"]) -> Float[Array
         >>> level_set_normals(lambda x: x @ x - 1, jnp.array([[0.0, 2.0]])).tolist()
         [[0.0, 1.0]]
     """
-    gradients = jax.vmap(jax.grad(phi))(jnp.asarray(points))
-    length = jnp.linalg.norm(gradients, axis=1, keepdims=True)
+    points = _checked_points(points)
+    normals, length = _directions(_program(phi, points), points)
     if is_concrete(length):
-        size = np.asarray(length)[:, 0]
+        size = np.asarray(length)
         bad = ~(np.isfinite(size) & (size > 0))
         raise_at(bad, "gradient of phi at point {i} has length {v}", size)
-    return gradients / length
+    return normals
 
 
 def level_set_curvature(
@@ -235,6 +250,9 @@ def level_set_curvature(
         Mean curvature in 1/length and Gauss curvature in 1/length², `(n,)` each.
 
     Differentiable: forward and reverse, in the points and in what `phi` depends on.
+    Raises:
+        ValueError: the gradient vanishes or is not finite, named by point, on concrete arrays.
+        TypeError: phi is no function that JAX can trace.
 
     Example:
         >>> mean, gauss = level_set_curvature(lambda x: x @ x - 4, jnp.array([[0.0, 0.0, 2.0]]))
@@ -242,6 +260,16 @@ def level_set_curvature(
         (0.5, 0.25)
     """
 
+    points = _checked_points(points)
+    mean, gauss = _curvatures(_program(phi, points), points)
+    if is_concrete(mean, gauss):
+        bad = ~(np.isfinite(mean) & np.isfinite(gauss))
+        raise_at(bad, "curvature at point {i} is {v}: the gradient of phi vanishes", mean)
+    return mean, gauss
+
+
+@eqx.filter_jit
+def _curvatures(phi: Traced, points):
     def single(point):
         gradient, hessian = jax.grad(phi)(point), jax.hessian(phi)(point)
         length = jnp.linalg.norm(gradient)
@@ -251,7 +279,7 @@ def level_set_curvature(
         trace = jnp.trace(shape)
         return trace / (point.size - 1), (trace**2 - jnp.sum(shape * shape.T)) / 2
 
-    return jax.vmap(single)(jnp.asarray(points))
+    return jax.vmap(single)(points)
 
 
 def double_torus(thickness: float | Float[Array, ""] = 0.4) -> tuple[LevelSet, Bounds]:
@@ -282,10 +310,12 @@ def double_torus(thickness: float | Float[Array, ""] = 0.4) -> tuple[LevelSet, B
         >>> bool(0.9 < jax.grad(width)(0.4) < 1.1)
         True
     """
-    if is_concrete(jnp.asarray(thickness)) and not 0.3 <= thickness <= 0.55:
-        raise ValueError(f"thickness is {thickness}, expected a number from 0.3 to 0.55")
+    # An array, not a constant of the program: other thicknesses run what is compiled.
+    radius = jnp.asarray(real(thickness, "thickness", least=0.3, most=0.55), jnp.result_type(float))
 
     def phi(x):
+        thickness = radius.astype(x.dtype)
+
         def torus(centre):
             y = x - jnp.array([centre, 0.0, 0.0], x.dtype)
             tube = (y @ y + 1 - thickness**2) ** 2 - 4 * (y[0] ** 2 + y[1] ** 2)
@@ -318,49 +348,95 @@ def _newton_on_ray(phi, start, direction, limit, max_steps):
     return t, step
 
 
+def _program(phi: LevelSet, points) -> Traced:
+    """The level-set function as a program, for points of this kind."""
+    point = jax.ShapeDtypeStruct(points.shape[-1:], points.dtype)
+    value = differentiable(phi, "phi", point)
+    if not isinstance(value, jax.ShapeDtypeStruct) or value.shape != ():
+        what = getattr(value, "shape", f"a {type(value).__name__}")
+        raise ValueError(f"phi must return a scalar for one point, its values have shape {what}")
+    if not jnp.issubdtype(value.dtype, jnp.floating):
+        raise TypeError(f"phi returns {value.dtype}, expected a real number")
+    return canonical(phi, jnp.zeros(point.shape, point.dtype))
+
+
+def _checked_points(points) -> Float[Array, "n d"]:
+    points = as_float(points, "points")
+    if points.ndim != 2 or points.shape[1] not in (2, 3):
+        raise ValueError(f"points must have shape (n, 2) or (n, 3), not {points.shape}")
+    return finite(points, "points")
+
+
+@eqx.filter_jit
+def _values_and_gradients(phi: Traced, points):
+    return jax.vmap(jax.value_and_grad(phi))(points)
+
+
+@eqx.filter_jit
+def _directions(phi: Traced, points):
+    gradients = jax.vmap(jax.grad(phi))(points)
+    length = jnp.linalg.norm(gradients, axis=1)
+    return gradients / length[:, None], length
+
+
+def _onto(look, start: np.ndarray, limit: float | None = None, *, most: float = np.inf):
+    """As `project_to_level_set`, on the host: points and normals, NaN where there are none.
+
+    Args:
+        look: values and gradients of phi.
+        start: where the rays begin.
+        limit: a shorter Newton step is the last; None for that of `project_to_level_set`.
+        most: points further than this along their rays are given up.
+    """
+    if limit is None:
+        eps = float(jnp.finfo(jnp.result_type(float)).eps)
+        limit = eps ** (2 / 3) * np.abs(start).max(initial=eps)
+    found, normals = np.full(start.shape, np.nan), np.full(start.shape, np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value, gradient = look(start)
+        length = np.linalg.norm(gradient, axis=1)
+        ray, t = gradient / length[:, None], -value / length
+        left = np.flatnonzero(np.abs(t) <= most)
+        gradient, step = gradient[left], t[left]
+        for _ in range(_STEPS):
+            done = np.abs(step) <= limit
+            rows = left[done]
+            found[rows] = start[rows] + t[rows, None] * ray[rows]
+            length = np.linalg.norm(gradient[done], axis=1, keepdims=True)
+            normals[rows] = gradient[done] / length
+            left = left[~done & (np.abs(t[left]) <= most)]
+            if not left.size:
+                break
+            value, gradient = look(start[left] + t[left, None] * ray[left])
+            step = -value / np.sum(gradient * ray[left], axis=1)
+            t[left] += step
+    return found, normals
+
+
 def _checked_bounds(bounds) -> np.ndarray:
-    box = np.asarray(bounds, float)
+    box = on_host(bounds, "bounds")
     if box.ndim != 2 or box.shape[0] != 2 or box.shape[1] not in (2, 3):
         raise ValueError(
             f"bounds must be two corners in 2 or 3 dimensions, shape (2, d), not {box.shape}"
         )
     if not (np.isfinite(box).all() and (box[1] > box[0]).all()):
         raise ValueError(f"upper corner {box[1]} must exceed lower corner {box[0]} on every axis")
-    return box
+    return in_range(box, "bounds")
 
 
-def _in_chunks(function, dtype):
-    """Call a compiled function on blocks of one shape and gather the results as NumPy arrays."""
-
-    def call(points):
-        points = np.asarray(points, dtype)
-        blocks = []
-        for first in range(0, len(points), _CHUNK):
-            block = points[first : first + _CHUNK]
-            filler = np.broadcast_to(block[-1], (_CHUNK - len(block), block.shape[1]))
-            result = function(jnp.asarray(np.concatenate([block, filler])))
-            blocks.append(jax.tree.map(np.asarray, result))
-        return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(points)], *blocks)
-
-    return call
-
-
-def _crossed_cells(values, box: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
+def _crossed_cells(look, box: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
     """Lower corners of the grid cells in and next to which phi changes sign, and their size."""
     side = box[1] - box[0]
     counts = np.maximum(np.ceil(resolution * side / side.max() - 1e-9).astype(int), 4)
     size = side / counts
     axes = [box[0, a] + size[a] * np.arange(counts[a] + 1) for a in range(len(side))]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(side))
-    phi = values(nodes)
-    if phi.ndim != 1:
-        raise ValueError(f"phi must return a scalar, its values have shape {phi.shape[1:]}")
-    raise_at(np.isnan(phi), "phi is not a number at {v}", nodes)
-    inside = (phi < 0).reshape(counts + 1)
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    phi = look(nodes.reshape(-1, len(side)))[0].reshape(counts + 1)
+    inside, unknown = _signs(phi, nodes)
     if inside.all() or not inside.any():
         raise ValueError(
-            f"phi has no zero within the bounds: it goes from {phi.min():.3g} to {phi.max():.3g} "
-            f"on a grid of {' x '.join(map(str, counts))} cells"
+            f"phi has no zero within the bounds: it goes from {np.nanmin(phi):.3g} to "
+            f"{np.nanmax(phi):.3g} on a grid of {' x '.join(map(str, counts))} cells{unknown}"
         )
     for axis in range(len(side)):
         for end, name in ((0, "lower"), (-1, "upper")):
@@ -368,7 +444,7 @@ def _crossed_cells(values, box: np.ndarray, resolution: int) -> tuple[np.ndarray
             if face.any() and not face.all():
                 raise ValueError(
                     f"the level set leaves the bounds through the {name} side of axis {axis}: "
-                    "give larger bounds (only closed level sets can be sampled)"
+                    f"give larger bounds (only closed level sets can be sampled){unknown}"
                 )
     crossed = ndimage.minimum_filter(inside, size=2) != ndimage.maximum_filter(inside, size=2)
     crossed = crossed[(slice(1, None),) * len(side)]
@@ -376,7 +452,32 @@ def _crossed_cells(values, box: np.ndarray, resolution: int) -> tuple[np.ndarray
     return box[0] + size * np.argwhere(crossed), size
 
 
-def _candidates(project: Project, cells, size, box, m: int, seed: int):
+def _signs(phi: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, str]:
+    """Where phi < 0, and a note on nodes where it is no number.
+
+    Such nodes, like the centre of a star shape, are on the side that all nodes around them are on.
+    """
+    inside, lost = phi < 0, np.isnan(phi)
+    if not lost.any():
+        return inside, ""
+    if lost.all():
+        raise ValueError("phi is not a number anywhere within the bounds")
+    around = np.ones((3,) * phi.ndim)
+    label, _ = ndimage.label(lost, around)
+    for part, box in enumerate(ndimage.find_objects(label), 1):
+        wide = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in box)
+        here = label[wide] == part
+        rim = ndimage.binary_dilation(here, around) & ~lost[wide]
+        sides = inside[wide][rim]
+        if sides.any() and not sides.all():
+            place = nodes[wide][here][0]
+            raise ValueError(f"phi is not a number at {place}, next to where it changes sign")
+        inside[wide][here] = sides.any()
+    first = nodes[lost][0]
+    return inside, f" (phi is not a number at {first} and {lost.sum() - 1} other nodes)"
+
+
+def _candidates(look, cells, size, box, m: int, seed: int):
     """At least about m points spread evenly over the surface, their normals, and its area."""
     rng = np.random.default_rng(seed)
     dim = len(size)
@@ -385,7 +486,7 @@ def _candidates(project: Project, cells, size, box, m: int, seed: int):
     width = 0.5 * size.min()
     each = max(1, round(m * 4 * size.max() / size.min() / len(cells)))
     start = (cells[:, None] + size * rng.random((len(cells), each, dim))).reshape(-1, dim)
-    points, normals = project(start)
+    points, normals = _onto(look, start, most=_STRAY * width)
     reached = np.isfinite(points).all(axis=1) & np.isfinite(normals).all(axis=1)
     near = np.zeros(len(start), bool)
     near[reached] = np.linalg.norm(points[reached] - start[reached], axis=1) <= width

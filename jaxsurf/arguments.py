@@ -76,7 +76,7 @@ def in_range(values: Any, name: str) -> Any:
     """
     largest = float(np.finfo(float).max ** (1 / 3))
     size = np.abs(np.atleast_1d(np.asarray(values, float)))
-    size = size.reshape(len(size), -1).max(axis=1, initial=0)
+    size = size.max(axis=tuple(range(1, size.ndim)), initial=0)
     text = f"{name}: size {{v:.3g}} in row {{i}}, at most {largest:.3g} can be calculated with"
     raise_at(size > largest, text, size)
     return values
@@ -242,7 +242,7 @@ def _short(value: Any) -> str:
 
 
 def _described(value: Any, array: Any) -> str:
-    if isinstance(value, str | bytes) or value is None:
+    if isinstance(value, str | bytes) or value is None or array.shape == ():
         return _short(value)
     kind = {"O": "objects", "U": "text", "S": "text"}.get(array.dtype.kind, str(array.dtype))
     return f"an array of {kind} of shape {array.shape}"

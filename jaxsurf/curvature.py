@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .cloud import PointCloud
-from .frames import tangent_frames
+from .frames import frames_of
 from .neighbors import Neighbors
 from .operators import laplace_beltrami, surface_gradient
 from .stencils.dcpse import DCPSE
@@ -168,6 +168,6 @@ def _in_tangent_plane(cloud, neighbors, method):
     """The shape tensor as a symmetric 2 x 2 matrix, and the tangents that it refers to."""
     if cloud.dim != 3:
         raise ValueError(f"a surface in 3 dimensions is needed, the cloud has {cloud.dim}")
-    tangents = tangent_frames(cloud.normals)[:, :2]
+    tangents = frames_of(cloud.normals)[:, :2]
     tensor = shape_tensor(cloud, neighbors, method=method)
     return jnp.einsum("nap,npq,nbq->nab", tangents, tensor, tangents), tangents

@@ -459,9 +459,9 @@ def _check_count(n: int, least: int) -> None:
 
 def _check_positive(name: str, value: float) -> None:
     real(value, name, above=0)
-    in_range(value, name)
     if not is_concrete(value):
         raise TypeError(f"{name} must be concrete: points are chosen outside jit and grad")
+    in_range(value, name)
 
 
 def _checked_axes(axes: tuple[float, float, float]) -> np.ndarray:

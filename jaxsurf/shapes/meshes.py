@@ -247,7 +247,8 @@ def clean_mesh(
 
     Example:
         >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-        >>> mesh, kept = js.clean_mesh(corners, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+        >>> triangles = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+        >>> mesh, kept = js.clean_mesh(corners, triangles)
         >>> mesh.closed, kept.tolist()
         (True, [0, 1, 2, 3])
     """
@@ -324,7 +325,8 @@ def sample_mesh(
             given).
 
     Example:
-        >>> mesh = js.TriangleMesh([[0, 0, 0], [1, 0, 0], [1, 1, 0.0]], [[0, 1, 2]])
+        >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]])
+        >>> mesh = js.TriangleMesh(corners, np.array([[0, 1, 2]]))
         >>> cloud = js.sample_mesh(mesh, n=200, smooth=False)
         >>> cloud.n, bool(jnp.all(cloud.normals == jnp.array([0.0, 0.0, 1.0])))
         (200, True)
@@ -421,7 +423,7 @@ def _border_points(mesh: TriangleMesh, spacing: float) -> Float[Array, "b 3"]:
     return np.concatenate(found)
 
 
-def _vertex_numbers(triangles) -> Int[Array, "m 3"]:
+def _vertex_numbers(triangles) -> Int[Array, "..."]:
     numbers = on_host(triangles, "triangles")
     if not (np.isfinite(numbers) & (numbers == np.rint(numbers))).all():
         raise ValueError("triangles must hold whole numbers of vertices")

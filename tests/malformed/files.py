@@ -273,8 +273,8 @@ MESHES = [
     ),
     Case(
         "TriangleMesh",
-        "lists of lists",
-        lambda: js.TriangleMesh(CORNERS.tolist(), FACES.tolist()),
+        "vertex numbers of another kind",
+        lambda: js.TriangleMesh(CORNERS, FACES.astype(np.int16)),
         right=lambda m: m.closed,
     ),
     Case("clean_mesh", "no triangles", lambda: js.clean_mesh(CORNERS, np.empty((0, 3))), ("no t",)),

@@ -149,8 +149,15 @@ def _outward(points, normals, area, label) -> np.ndarray:
     flux = area * np.einsum("nd,nd->n", points - centre[label], normals)
     total, scale = np.bincount(label, flux), np.bincount(label, np.abs(flux))
     reach = np.bincount(label, area * np.linalg.norm(points - centre[label], axis=1))
-    # An open flat sheet encloses nothing: its first normal component that counts is positive.
+    # An open sheet that is flat, or bends as much to one side as to the other, encloses nothing:
+    # the first component of its mean normal that counts is positive, and where there is none
+    # (a helicoid) that of the normal at one end. No sign is left to the last bit.
     mean = np.stack([np.bincount(label, c) / size for c in normals.T], axis=1)
+    high = points @ np.array([1.0, 0.61, 0.37])[: points.shape[1]]
+    end = np.lexsort((high, label))[np.cumsum(np.bincount(label))[label] - 1]
+    last = np.zeros_like(mean)
+    last[label] = normals[end]
+    mean = np.where(np.abs(mean).max(axis=1, keepdims=True) > 1e-3, mean, last)
     leading = mean[np.arange(len(mean)), np.argmax(np.abs(mean).round(6), axis=1)]
-    flat = scale <= 1e-6 * reach
-    return np.where(np.where(flat, leading, total) < 0, -1, 1)[label]
+    undecided = (scale <= 1e-6 * reach) | (np.abs(total) <= 1e-3 * scale)
+    return np.where(np.where(undecided, leading, total) < 0, -1, 1)[label]

@@ -14,6 +14,8 @@ from jaxsurf.cloud import PointCloud
 from jaxsurf.frames import estimate_normals, from_points, refit_normals, tangent_frames
 from jaxsurf.neighbors import Neighbors, find_neighbors
 
+from .helpers import check_derivative
+
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
@@ -396,3 +398,83 @@ def test_a_normal_that_its_fit_turns_over():
     neighbors = find_neighbors(PointCloud(x, x), 24)
     with pytest.raises(ValueError, match=r"turned the normal of point \d+ over \(cosine -"):
         refit_normals(jnp.asarray(rough), jnp.asarray(x), neighbors, degree=4)
+
+
+# --- under jit, on curves, last bits ---------------------------------------------------------
+
+
+def test_what_is_refused_is_nan_under_jit():
+    """Too few neighbours, and a normal turned over: marked at their points, not elsewhere."""
+    x = jnp.asarray(fibonacci(300))
+    neighbors = find_neighbors(PointCloud(x, x), 24)
+    refit = jax.jit(partial(refit_normals, degree=4))
+    poor = Neighbors(neighbors.indices, neighbors.mask.at[9, 14:].set(False))
+    lost = np.isnan(np.asarray(refit(x, x, poor))).any(axis=1)
+    assert np.flatnonzero(lost).tolist() == [9]
+    rough = x * (1 + 0.3 * np.random.default_rng(0).uniform(-1, 1, (300, 1)))
+    lost = np.isnan(np.asarray(refit(rough, x, neighbors))).any(axis=1)
+    assert 0 < lost.sum() < 100
+    with pytest.raises(ValueError, match=rf"turned the normal of point {np.argmax(lost)} over"):
+        refit_normals(rough, x, neighbors, degree=4)
+
+
+def test_gradients_on_plane_curves():
+    t = 2 * np.pi * (np.arange(40) + 0.2 * np.sin(np.arange(40))) / 40
+    points = jnp.asarray(np.stack([2 * np.cos(t), np.sin(t)], axis=1))
+    normals = jnp.asarray(unit(np.stack([np.cos(t), 2 * np.sin(t)], axis=1)))
+    neighbors = find_neighbors(PointCloud(points, normals), 9)
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=(40, 2)))
+
+    def value(points, normals):
+        normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+        fitted = refit_normals(points, normals, neighbors, degree=4, iterations=1)
+        return jnp.vdot(weights, fitted) + jnp.sum(tangent_frames(fitted)[:, 0] ** 3)
+
+    check_derivative(lambda x: value(x, normals), points)
+    check_derivative(lambda m: value(points, m), normals + 0.05 * weights / 3)
+
+
+def test_gradient_of_frames():
+    normals = jnp.asarray(unit(np.random.default_rng(1).normal(size=(20, 3))))
+    weights = jnp.asarray(np.random.default_rng(2).normal(size=(20, 3, 3)))
+
+    def value(x):
+        return jnp.vdot(weights, tangent_frames(x / jnp.linalg.norm(x, axis=1, keepdims=True)))
+
+    check_derivative(value, normals)
+
+
+def test_single_precision_without_x64():
+    """Refitted normals to 1e-5 at 1,000 points, with JAX as it comes."""
+    x = fibonacci(1_000)
+    with jax.enable_x64(False):
+        cloud = from_points(x)
+        neighbors = find_neighbors(cloud, 45)
+        refitted = refit_normals(cloud.points, cloud.normals, neighbors, degree=4)
+        assert refitted.dtype == cloud.normals.dtype == jnp.float32
+    assert angle(cloud.normals, x) < 2e-5
+    assert angle(refitted, x) < 2e-5
+
+
+def saddle(n=15):
+    a = np.linspace(-1, 1, n)
+    x, y = (g.ravel() for g in np.meshgrid(a, a))
+    return np.stack([x, y, 0.3 * (x * x - y * y)], axis=1)
+
+
+def helicoid(n=15):
+    s, t = (g.ravel() for g in np.meshgrid(np.linspace(-1, 1, n), np.linspace(-3, 3, 3 * n)))
+    return np.stack([s * np.cos(t), s * np.sin(t), t], axis=1)
+
+
+@pytest.mark.parametrize("make", [saddle, helicoid, lambda: fibonacci(200)])
+def test_signs_do_not_hang_on_the_last_bit(make):
+    """Sheets that enclose nothing, and lattices full of ties: changed by 1e-15, and reordered."""
+    points, rng = make(), np.random.default_rng(0)
+    normals = np.asarray(estimate_normals(points, degree=2))
+    for _ in range(4):
+        moved = points * (1 + 1e-15 * rng.normal(size=points.shape))
+        assert angle(estimate_normals(moved, degree=2), normals) < 1e-9
+        # Of neighbours at the same distance those with the lower numbers are taken.
+        order = rng.permutation(len(points))
+        assert angle(estimate_normals(moved[order], degree=2), normals[order]) < 1e-3

@@ -25,6 +25,8 @@ from jaxsurf.shapes.implicit import (
 )
 from jaxsurf.shapes.sampling import ideal_spacing, measure_quality
 
+from .helpers import check_derivative, count_compilations
+
 
 def sphere_phi(x):
     return x @ x - 1
@@ -395,3 +397,100 @@ def test_single_precision():
     assert found.dtype == jnp.float32
     assert level_set_normals(torus_phi, found).dtype == jnp.float32
     assert float(jnp.abs(jax.vmap(torus_phi)(found.astype(float))).max()) < 3e-6
+
+
+# --- where phi is no number, last bits, compilations, precision ------------------------------
+
+
+def star(x):
+    r = jnp.sqrt(x @ x)
+    return r - 1 - 0.2 * x[0] * x[1] / r**2  # 0/0 at the centre
+
+
+def test_a_star_shape_whose_centre_is_a_node_of_the_grid():
+    assert np.isnan(star(jnp.zeros(3)))
+    cloud = level_set(star, n=300, bounds=((-1.3,) * 3, (1.3,) * 3))
+    assert cloud.n == 300
+    assert float(jnp.abs(jax.vmap(star)(cloud.points)).max()) < 1e-13
+    assert measure_quality(cloud.points, measure=4 * np.pi * 1.01).smallest > 0.7
+
+
+def test_other_parameters_and_the_same_code_compile_nothing():
+    def every(thickness, shift):
+        phi, bounds = double_torus(thickness)
+        points = level_set(phi, n=100, bounds=bounds, resolution=16, steps=5).points
+        level_set_normals(phi, points)
+        level_set_curvature(phi, points)
+        project_to_level_set(phi, 1.01 * points)
+        ball = level_set(lambda x: x @ x - shift, n=60, bounds=((-2,) * 2, (2,) * 2), steps=3)
+        torus(60, 3.0, thickness)
+        surface_of_revolution(lambda s: (shift + s, s), 60)
+        graph(lambda x, y: shift * x * y, 60)
+        sphere(60, radius=thickness), circle(60), ellipsoid(60, (1, 2, 1 + thickness), steps=2)
+        return ball
+
+    every(0.4, jnp.asarray(1.0))
+    with count_compilations() as names:
+        every(0.45, jnp.asarray(1.1))
+    assert not names, names
+
+
+def ellipsoid_of(axes):
+    return lambda x: jnp.sum((x / axes) ** 2) - 1
+
+
+@pytest.mark.parametrize("function", ["normals", "curvature"])
+def test_gradients_in_points_and_parameters(function):
+    """Normals and curvatures against central differences; jit and vmap against the plain loop."""
+    axes = jnp.array([1.0, 1.3, 0.8])
+    points = ellipsoid(6, (1.0, 1.3, 0.8), steps=0).points + 0.05
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=(2, 6, 3)))
+
+    def value(axes, points):
+        if function == "normals":
+            return jnp.sum(weights[0] * level_set_normals(ellipsoid_of(axes), points))
+        mean, gauss = level_set_curvature(ellipsoid_of(axes), points)
+        return weights[0, :, 0] @ mean + weights[1, :, 0] @ gauss
+
+    check_derivative(lambda x: value(axes, x), points)
+    check_derivative(lambda a: value(a, points), axes)
+    two = jnp.stack([points, 1.1 * points])
+    mapped = jax.jit(jax.vmap(value, in_axes=(None, 0)))(axes, two)
+    np.testing.assert_allclose(mapped, [value(axes, x) for x in two], rtol=1e-12)
+
+
+def test_level_sets_in_single_precision():
+    """Points within 3e-6 of the surface, normals to 1e-5, curvatures to 1e-4."""
+    with jax.enable_x64(False):
+        cloud = level_set(sphere_phi, n=300, bounds=((-1.2,) * 3, (1.2,) * 3))
+        mean, gauss = level_set_curvature(sphere_phi, cloud.points)
+        assert {a.dtype for a in (cloud.points, cloud.normals, mean)} == {jnp.dtype("float32")}
+        others = (sphere(50), circle(50), torus(60, 3.0, 1.0), ellipsoid(50, (1, 2, 3)))
+        assert all(c.points.dtype == jnp.float32 for c in others)
+        bump = graph(lambda x, y: x * y, 50)
+        vase = surface_of_revolution(lambda s: (1 + s, s), 60)
+        assert bump.points.dtype == vase.points.dtype == jnp.float32
+        phi, _ = double_torus()
+        assert level_set_normals(phi, jnp.array([[0.0, 0.3, 0.9]])).dtype == jnp.float32
+    points = np.asarray(cloud.points, float)
+    assert np.abs(np.linalg.norm(points, axis=1) - 1).max() < 3e-6
+    assert np.abs(np.asarray(cloud.normals) - points).max() < 1e-5
+    assert np.abs(np.asarray(mean) - 1).max() < 1e-4 and np.abs(np.asarray(gauss) - 1).max() < 1e-4
+    torus_points = np.asarray(others[2].points, float)
+    assert np.abs(jax.vmap(torus_phi)(jnp.asarray(torus_points))).max() < 1e-5
+
+
+def test_last_bits_move_no_point_to_another_place():
+    """Radii that are changed by 1e-15 give the same rings, counts and order."""
+    rng = np.random.default_rng(0)
+    for make, size in (
+        (lambda a: surface_of_revolution(lambda s: (1.0 + 0 * s, jnp.asarray(a) * s), 1_005), 1.0),
+        (lambda a: torus(500, 3.0, a), 1.0),
+        (lambda a: ellipsoid(200, (0.3 * a, 0.6 * a, 1.2 * a), steps=3), 1.0),
+        (lambda a: graph(lambda x, y: jnp.asarray(a) * x * y, (16, 16)), 1.0),
+        (lambda a: sphere(300, radius=a), 1.0),
+    ):
+        first = np.asarray(make(size).points)
+        for _ in range(3):
+            other = make(size * (1 + 1e-15 * rng.normal())).points
+            assert np.abs(np.asarray(other) - first).max() < 1e-12

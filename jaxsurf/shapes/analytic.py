@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -457,7 +458,7 @@ def _check_count(n: int, least: int) -> None:
         raise ValueError(f"n = {n} points, needs at least {least}")
 
 
-def _check_positive(name: str, value: float) -> None:
+def _check_positive(name: str, value: Any) -> None:
     real(value, name, above=0)
     if not is_concrete(value):
         raise TypeError(f"{name} must be concrete: points are chosen outside jit and grad")

@@ -263,8 +263,9 @@ def level_set_curvature(
     points = _checked_points(points)
     mean, gauss = _curvatures(_program(phi, points), points)
     if is_concrete(mean, gauss):
-        bad = ~(np.isfinite(mean) & np.isfinite(gauss))
-        raise_at(bad, "curvature at point {i} is {v}: the gradient of phi vanishes", mean)
+        values = np.asarray(mean)
+        bad = ~(np.isfinite(values) & np.isfinite(np.asarray(gauss)))
+        raise_at(bad, "curvature at point {i} is {v}: the gradient of phi vanishes", values)
     return mean, gauss
 
 

@@ -67,7 +67,7 @@ def canonical(f: Callable, *examples: PyTree[Array]) -> Traced:
     used = [i for i in range(count) if inputs[i] in kept]
     order = tuple(used), tuple(range(count, len(inputs)))
     program = Program(closed.jaxpr, order, _structure(leaves[1], rest[1]), results[0])
-    return Traced([constants[i] for i in used], program)
+    return Traced([jnp.asarray(constants[i]) for i in used], program)
 
 
 def numbers_as_arrays(tree: PyTree) -> PyTree:

@@ -16,11 +16,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
 from jaxsurf.arguments import in_range, instance, on_host, raise_at, real, whole
 from jaxsurf.cloud import PointCloud
 
+AnyArray = Array | np.ndarray
 Project = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 # Points are numbered in 32 bits.
@@ -98,8 +100,12 @@ def in_blocks(function: Callable, dtype, *, rows: int = 4_096) -> Callable:
 
 
 def poisson_disk(
-    candidates: np.ndarray, radius: float, *, normals: np.ndarray | None = None, seed: int = 0
-) -> np.ndarray:
+    candidates: Float[AnyArray, "m d"],
+    radius: float,
+    *,
+    normals: Float[AnyArray, "m d"] | None = None,
+    seed: int = 0,
+) -> Int[np.ndarray, " kept"]:
     """A random subset of the candidates, no two closer than `radius`, that cannot be enlarged.
 
     Args:
@@ -384,11 +390,11 @@ def jitter(
 
 
 def measure_quality(
-    points: np.ndarray,
+    points: Float[AnyArray, "n d"],
     *,
     measure: float,
-    normals: np.ndarray | None = None,
-    probes: np.ndarray | None = None,
+    normals: Float[AnyArray, "n d"] | None = None,
+    probes: Float[AnyArray, "q d"] | None = None,
 ) -> Quality:
     """Smallest and mean distance to the nearest neighbour, and the largest hole, over h.
 

@@ -94,7 +94,7 @@ def from_points(
         The points, in the order given, with the normals from `estimate_normals`.
 
     Accuracy: as `estimate_normals`.
-    Differentiable: no, as `estimate_normals`.
+    Not differentiable, as `estimate_normals`.
     Raises:
         ValueError, TypeError: as `estimate_normals`; a `boundary` that is no mask of n points.
 
@@ -139,7 +139,7 @@ def estimate_normals(
 
     Accuracy: angle O(h^degree) (`tests/test_frames.py::test_refit_order`); in float32 what rounding
         leaves, 1e-5 at 4,000 points (`tests/test_frames.py::test_single_precision`).
-    Differentiable: no; use `refit_normals` with these normals and fixed neighbours.
+    Not differentiable: use `refit_normals` with these normals and fixed neighbours.
     Raises:
         ValueError: traced or non-finite points, duplicates, too few points or neighbours for
             the degree, points on a line, surfaces with one side only (named by index, with

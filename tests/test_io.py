@@ -5,6 +5,7 @@ import tempfile
 import warnings
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import meshio
 import numpy as np
@@ -12,8 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import jaxsurf as js
 from jaxsurf.cloud import PointCloud
 from jaxsurf.io import read, read_fields, write
+from jaxsurf.shapes.analytic import sphere_projection
 
 from .test_meshes import ball_mesh, cube_mesh, fibonacci, mobius, real, sheet, torus_grid
 
@@ -621,3 +624,33 @@ def test_damaged_files_are_errors_or_files(whole_files, data):
             else:
                 if isinstance(found, PointCloud):
                     assert np.isfinite(found.points).all()
+
+
+def test_single_precision_without_x64(tmp_path):
+    """JAX as it comes: files, meshes, sorting, jitter and pictures in float32."""
+    with jax.enable_x64(False):
+        cloud = ellipsoid(80)
+        write(tmp_path / "a.vtu", cloud, {"u": cloud.points[:, 0]})
+        back, found = read(tmp_path / "a.vtu"), read_fields(tmp_path / "a.vtu")
+        assert back.points.dtype == found["u"].dtype == np.float32
+        assert (back.points == cloud.points).all() and (found["u"] == cloud.points[:, 0]).all()
+        sampled = js.sample_mesh(ball_mesh(300), n=100)
+        assert sampled.normals.dtype == jnp.float32
+        assert np.abs(np.linalg.norm(sampled.points, axis=1) - 1).max() < 1e-3
+        tidy, order = js.sort_cloud(cloud)
+        assert (tidy.points == cloud.points[order]).all() and tidy.points.dtype == jnp.float32
+        ball = js.sphere(80)
+        moved = js.jitter(ball, sphere_projection(), spacing=0.3)
+        assert moved.points.dtype == jnp.float32
+        assert np.abs(np.linalg.norm(moved.points, axis=1) - 1).max() < 1e-6
+        kept = js.poisson_disk(ball.points, 0.5)
+        assert 10 < len(kept) < 80
+        figure = js.plot_fields(ball, {"u": ball.points[:, 0], "shape": None}, pixels=40)
+        assert len(figure.axes) == 3
+
+
+def test_a_mesh_says_what_it_is():
+    assert (
+        repr(sheet(3))
+        == "TriangleMesh(9 vertices, 8 triangles, 1 borders, genus 0, edges of 0.552)"
+    )

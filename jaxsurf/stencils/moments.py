@@ -58,21 +58,19 @@ def moment_solve(
 
 def _solve(x, w, b, low, high):
     """What `moment_solve` returns, and what its derivative needs of it."""
-    v: list[Array] | Array = monomial_rows(x, high)
+    small = len(b) <= systems.SMALL
+    v: list[Array] | Array = monomial_rows(x, high) if small else monomials(x, high)
     start = len(multi_indices(len(x), 0, low - 1))
-    b = [row.reshape(-1, *(1,) * (w.ndim - 1)) for row in b.astype(w.dtype)]
-    if len(b) > systems.SMALL:
-        v = jnp.stack(v)
-        b = jnp.stack([jnp.broadcast_to(row, (len(row), *w.shape[1:])) for row in b])
-    gram = _gram(x, w, low, high)
-    solve, condition = systems.factor(gram)
-    a = solve(b)
+    b = b.astype(w.dtype).reshape(*b.shape, *(1,) * (w.ndim - 1))
+    wanted = list(b) if small else jnp.broadcast_to(b, (*b.shape[:2], *w.shape[1:]))
+    solve, condition = systems.factor(gram := _gram(x, w, low, high))
+    a = solve(wanted)
     s = systems.combine(a, v[start:])
     eta = w * s
     # The moments of eta are A a.
-    errors = [jnp.abs(m - b_i) for m, b_i in zip(systems.symmetric(gram, a), b)]
-    size = functools.reduce(jnp.maximum, [jnp.max(jnp.abs(b_i), axis=0) for b_i in b])
-    residual = jnp.max(functools.reduce(jnp.maximum, errors), axis=0) / size
+    found = systems.symmetric(gram, a)
+    error = jnp.abs((jnp.stack(found) if small else found) - b)
+    residual = jnp.max(error, axis=(0, 1)) / jnp.max(jnp.abs(b))
     return (eta, condition, residual), (v, start, solve, a, s)
 
 

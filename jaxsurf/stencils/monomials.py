@@ -45,8 +45,16 @@ def _parents(dim: int, high: int) -> tuple[tuple[int, int], ...]:
 
 
 def monomials(x: Float[Array, "dim *q"], high: int) -> Float[Array, "m *q"]:
-    """All monomials of degree 0 to `high`, one multiplication each."""
-    return jnp.stack(monomial_rows(x, high))
+    """All monomials of degree 0 to `high`, one multiplication each, a degree at a time."""
+    dim = len(x)
+    degrees = [jnp.ones_like(x[:1])]
+    for degree in range(1, high + 1):
+        # Those that begin with x_a are x_a times the lower ones in x_a and the coordinates after
+        # it, which stand last.
+        lower = degrees[-1]
+        tails = [math.comb(degree - 1 + dim - 1 - a, dim - 1 - a) for a in range(dim)]
+        degrees.append(jnp.concatenate([x[a] * lower[-t:] for a, t in enumerate(tails)]))
+    return jnp.concatenate(degrees)
 
 
 def monomial_rows(

@@ -61,77 +61,79 @@ def factor(gram):
     moment is dependent on the others (a flat surface with few normal copies, say); one step of
     refinement on the unshifted matrix takes the effect of the shift away again.
     """
-    m = len(gram)
-    diagonal = [gram[i][i] for i in range(m)]
-    scale = [jax.lax.rsqrt(jnp.where(d > 0, d, 1)) for d in diagonal]
-    shift = 4 * m * jnp.finfo(diagonal[0].dtype).eps
-    return (_small if isinstance(gram, list) else _large)(gram, scale, shift)
+    small = isinstance(gram, list)
+    a = jnp.stack([jnp.stack(row) for row in gram]) if small else gram
+    diagonal = _diagonal(a)
+    scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
+    a = a * scale * scale[:, None]
+    shift = 4 * len(a) * jnp.finfo(a.dtype).eps
+    solve_scaled, pivot = (_by_columns if small else _by_lapack)(a, shift)
+
+    def solve(b):
+        x = solve_scaled((jnp.stack(b) if small else b) * scale[:, None]) * scale[:, None]
+        return list(x) if small else x
+
+    return solve, (jnp.max(pivot, axis=0) / jnp.min(pivot, axis=0)) ** 2
 
 
-def _small(gram, scale, shift):
-    m = len(gram)
-    a = [[gram[i][j] * scale[i] * scale[j] for j in range(m)] for i in range(m)]
-    lower: list[list] = []
-    pivot: list = []
-    for i in range(m):
-        row: list = []
-        for j in range(i):
-            row.append(_minus_dot(a[i][j], row, lower[j]) / pivot[j])
-        lower.append(row)
-        pivot.append(jnp.sqrt(_minus_dot(a[i][i] + shift, row, row)))
+def _by_columns(a, shift):
+    """Cholesky's factor column by column, for all points at once.
+
+    Loops, whose bodies are short: written out, 14 unknowns take ten seconds to compile.
+    """
+    m = len(a)
+    rows = jnp.arange(m).reshape(m, *(1,) * (a.ndim - 2))
+
+    def eliminate(j, columns):
+        # Columns that are not there yet are zero.
+        column = a[j] - jnp.sum(columns * columns[:, j, None], axis=0)
+        column = jnp.where(rows == j, column + shift, column)
+        column = jnp.where(rows < j, 0, column * jax.lax.rsqrt(column[j]))
+        return columns.at[j].set(column)
+
+    columns = jax.lax.fori_loop(0, m, eliminate, jnp.zeros_like(a))
+    pivot = _diagonal(columns)
 
     def substitute(b):
-        y: list = []
-        for i in range(m):
-            y.append(_minus_dot(b[i], lower[i], y) / pivot[i])
-        x: list = []
-        for i in reversed(range(m)):
-            column = [lower[j][i] for j in reversed(range(i + 1, m))]
-            x.append(_minus_dot(y[i], column, x) / pivot[i])
-        return x[::-1]
+        def forward(i, y):
+            rest = b[i] - jnp.sum(columns[:, i, None] * y, axis=0)
+            return y.at[i].set(rest / pivot[i])
+
+        def backward(j, x):
+            i = m - 1 - j
+            rest = y[i] - jnp.sum(columns[i, :, None] * x, axis=0)
+            return x.at[i].set(rest / pivot[i])
+
+        y = jax.lax.fori_loop(0, m, forward, jnp.zeros_like(b))
+        return jax.lax.fori_loop(0, m, backward, jnp.zeros_like(b))
 
     def solve(b):
-        b = [b_i * s for b_i, s in zip(b, scale)]
-
         def refine(_, x):
-            return add(x, substitute([_minus_dot(b_i, row, x) for b_i, row in zip(b, a)]))
+            return x + substitute(b - jnp.sum(a[:, :, None] * x[:, None], axis=0))
 
-        # A loop, because what goes in and comes out of one is stored; what is not, a compiler
-        # computes again at every use.
-        zero = [
-            jnp.zeros(jnp.broadcast_shapes(b_i.shape, s.shape), s.dtype) for b_i, s in zip(b, scale)
-        ]
-        x = jax.lax.fori_loop(0, 2, refine, zero)
-        return [x_i * s for x_i, s in zip(x, scale)]
+        return jax.lax.fori_loop(0, 2, refine, jnp.zeros_like(b))
 
-    largest, smallest = (functools.reduce(f, pivot) for f in (jnp.maximum, jnp.minimum))
-    return solve, (largest / smallest) ** 2
+    return solve, pivot
 
 
-def _large(gram, scale, shift):
-    scale = jnp.stack(scale)
-    # LAPACK wants the matrix last.
-    points_first = lambda a: jnp.moveaxis(a, (0, 1), (-2, -1))
-    points_last = lambda a: jnp.moveaxis(a, (-2, -1), (0, 1))
-    a = points_first(gram * scale * scale[:, None])
-    chol = jnp.linalg.cholesky(a + shift * jnp.eye(len(gram), dtype=a.dtype))
-    pivots = jnp.diagonal(chol, axis1=-2, axis2=-1)
-    condition = (jnp.max(pivots, axis=-1) / jnp.min(pivots, axis=-1)) ** 2
+def _by_lapack(a, shift):
+    a = jnp.moveaxis(a, (0, 1), (-2, -1))  # LAPACK wants the matrix last
+    chol = jnp.linalg.cholesky(a + shift * jnp.eye(a.shape[-1], dtype=a.dtype))
 
     def solve(b):
-        b = points_first(b * scale[:, None])
+        b = jnp.moveaxis(b, (0, 1), (-2, -1))
         first = jax.scipy.linalg.cho_solve((chol, True), b)
         second = jax.scipy.linalg.cho_solve((chol, True), b - a @ first)
-        return points_last(first + second) * scale[:, None]
+        return jnp.moveaxis(first + second, (-2, -1), (0, 1))
 
-    return solve, condition
+    return solve, jnp.moveaxis(jnp.diagonal(chol, axis1=-2, axis2=-1), -1, 0)
+
+
+def _diagonal(a):
+    return a[np.arange(len(a)), np.arange(len(a))]
 
 
 def _total(terms, start=None):
     """Sum without a zero to begin with."""
     terms = list(terms)
     return functools.reduce(jnp.add, terms) if terms else start
-
-
-def _minus_dot(start, a: list, b: list):
-    return functools.reduce(lambda s, pair: s - pair[0] * pair[1], zip(a, b), start)

@@ -210,6 +210,30 @@ def indices_of(where: Any, n: int | None, name: str) -> Int[np.ndarray, " m"]:
     return given.astype(np.int32)
 
 
+def point_indices(indices: Any, name: str, *, axes: str, n: int) -> None:
+    """Check an array of indices of points, whose points run along its axis `n` (0 or -1).
+
+    Raises:
+        TypeError: not of an integer type.
+        ValueError: not two axes, no points or slots; on concrete arrays an index that is no point.
+    """
+    if not jnp.issubdtype(indices.dtype, jnp.integer):
+        raise TypeError(f"{name} are {indices.dtype}, expected integers")
+    if indices.ndim != 2 or 0 in indices.shape:
+        raise ValueError(f"{name} have shape {indices.shape}, expected {axes}, both at least 1")
+    if is_concrete(indices):
+        given, count = np.asarray(indices), indices.shape[n]
+        if given.min() < 0 or given.max() >= count:
+            where = np.argwhere((given < 0) | (given >= count))[0]
+            wrong, row = given[tuple(where)], where[n]
+            raise ValueError(f"{name} of point {row} name point {wrong}, there are {count}")
+
+
+def is_array(x: Any) -> bool:
+    """True for an array or what stands for one while JAX traces; False for other leaves."""
+    return isinstance(x, jax.Array | np.ndarray)
+
+
 def differentiable(f: Any, name: str, *arguments: jax.ShapeDtypeStruct) -> Any:
     """The shapes that a function returns, which must be one that JAX can trace.
 

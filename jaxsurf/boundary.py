@@ -28,7 +28,7 @@ from .borders import Border, checked_border, find_border, inward
 from .build import residual_tolerance, stencil_weights
 from .cloud import PointCloud
 from .conditions import Condition, checked_conditions
-from .neighbors import Neighbors, nearest_of
+from .neighbors import Neighbors, Rows, nearest_of
 from .stencils.gfdm import GFDM
 from .stencils.method import AbstractMethod
 from .stencils.stencil import AbstractOperator, Stencil
@@ -407,7 +407,7 @@ def _check_conormals(cloud, condition) -> None:
         )
 
 
-def _free_neighbors(cloud, rows, free, neighbors, method) -> Neighbors:
+def _free_neighbors(cloud, rows, free, neighbors, method) -> Rows:
     """Every row's own point, then free ones by distance; padding repeats a free one."""
     need = method.basis_size(cloud.dim, Gradient())
     radius = None
@@ -430,7 +430,7 @@ def _free_neighbors(cloud, rows, free, neighbors, method) -> Neighbors:
             f"{need - 1} besides the point itself ({int(np.sum(count < need))} such points)"
         )
     indices = np.where(mask, indices, indices[:, 1:2])
-    return Neighbors(jnp.asarray(indices), jnp.asarray(mask), radius)
+    return Rows(jnp.asarray(indices), jnp.asarray(mask), radius)
 
 
 def _nearest_free(cloud, rows, free, k):

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .arguments import is_concrete
+from .arguments import instance, is_concrete
+from .arguments import mask as checked_mask
 from .cloud import PointCloud
-from .neighbors import Neighbors, find_neighbors, nearest_of
+from .neighbors import Neighbors, Rows, find_neighbors, nearest_of
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood
 from .stencils.moments import blockwise, in_blocks, out_of_blocks
@@ -23,6 +24,8 @@ from .stencils.targets import Laplacian
 _DOMINANCE = 0.2
 # Sizes of the neighbourhoods of such points, in units of the usual one: tried in turn.
 _SIZES = (1.5, 2.25, 3.4, 0.67, 0.45)
+# Stencils that are tried at a time: few shapes are ever compiled.
+_CHUNK = 256
 
 
 def choose_neighbors(
@@ -51,9 +54,23 @@ def choose_neighbors(
         throw: passed on to `find_neighbors`.
 
     Returns:
-        Neighbour lists; rows shorter than the longest are padded.
+        Neighbour lists; rows shorter than the longest are padded. Where no size serves a point
+        inside the surface, a warning says how many and names the worst.
+
+    Raises:
+        TypeError: no cloud or method, a `bound` that is no mask.
+        ValueError: as `find_neighbors`.
+
+    Example:
+        >>> js.choose_neighbors(js.sphere(500), method=js.GFDM(degree=2)).k
+        36
     """
-    needed = np.ones(cloud.n, bool) if bound is None else ~np.asarray(bound)
+    instance(cloud, PointCloud, "cloud")
+    instance(method, AbstractMethod, "method")
+    if bound is None:
+        needed = np.ones(cloud.n, bool)
+    else:
+        needed = ~np.asarray(checked_mask(bound, cloud.n, "bound"))
     neighbors = _adapted(cloud, method, throw, needed)[0]
     mask = neighbors.mask & jnp.asarray(needed)[:, None]
     return Neighbors(neighbors.indices, mask, neighbors.radius)
@@ -61,6 +78,10 @@ def choose_neighbors(
 
 def build(cloud, neighbors, method, target, throw) -> Stencil:
     """The operator of a target, with neighbours chosen if there are none."""
+    instance(cloud, PointCloud, "cloud")
+    instance(method, AbstractMethod, "method", "DCPSE(order=2) or GFDM(degree=4), say")
+    if neighbors is not None:
+        instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
     weights = None
     if neighbors is None:
         neighbors, laplacian = _adapted(cloud, method, throw)
@@ -130,41 +151,73 @@ def _adapted(cloud, method, throw, needed=True):
     poor = np.flatnonzero(on & needed & (dominance < _DOMINANCE))
     need = method.basis_size(cloud.dim, Laplacian())
     sizes = [min(int(k * size), available) for size in _SIZES if k * size > 1.5 * need]
-    if not poor.size or max(sizes) <= k:
+    border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
+    if not poor.size or max(sizes, default=0) <= k:
+        _report(poor, dominance[poor], border, np.full(poor.size, k), method)
         return neighbors, found
 
     # Filled up with copies, so that few shapes are ever compiled.
-    rows = np.resize(poor, max(64, 1 << (poor.size - 1).bit_length()))
+    rows = np.resize(poor, -(-poor.size // _CHUNK) * _CHUNK)
     indices, mask = nearest_of(cloud, rows, max(sizes))
-    best, chosen = dominance[rows], np.full(rows.size, k)
-    border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
+    chosen, best = np.full(rows.size, k), dominance[rows]
+    kept = [_wider(np.asarray(a)[..., rows], max(sizes)) for a in jax.tree.leaves(found)]
     wanted = np.where(border & (dominance > -np.inf), _DOMINANCE, -np.inf)[rows]
     for size in sizes:
-        some = Neighbors(jnp.asarray(indices), jnp.asarray(mask & _first(size, mask)))
-        trial = stencil_weights(cloud, some, method, Laplacian(), jnp.asarray(rows))
+        trial = _in_chunks(cloud, indices, mask & _first(size, mask), method, rows)
         now = _dominance(*trial)
         better = (best < _DOMINANCE) & (now > best) & (now >= wanted)
         best = np.where(better, now, best)
         chosen = np.where(better, size, chosen)
-    widest = max(k, chosen.max())
-    mask = (mask & _first(chosen[:, None], mask))[:, :widest]
-    indices = np.where(mask, indices[:, :widest], rows[:, None])
-    adapted = Neighbors(jnp.asarray(indices), jnp.asarray(mask))
-    trial = stencil_weights(cloud, adapted, method, Laplacian(), jnp.asarray(rows))
+        kept = [np.where(better, new, old) for new, old in zip(jax.tree.leaves(trial), kept)]
+    _report(poor, best[: poor.size], border, chosen, method)
 
-    more = widest - k
-    own = jnp.broadcast_to(jnp.arange(cloud.n)[:, None], (cloud.n, more))
-    all_indices = jnp.concatenate([neighbors.indices, own.astype(indices.dtype)], axis=1)
-    all_mask = jnp.pad(neighbors.mask, ((0, 0), (0, more)))
-    weights, diagnostics = found
-    put = lambda a, b: a.at[..., rows].set(b)
-    return (
-        Neighbors(all_indices.at[rows].set(indices), all_mask.at[rows].set(mask)),
-        (
-            put(jnp.pad(weights, ((0, more), (0, 0))), trial[0]),
-            jax.tree.map(put, diagnostics, trial[1]),
-        ),
-    )
+    widest = max(k, chosen.max())
+    own = np.tile(np.arange(cloud.n, dtype=np.int32)[:, None], widest - k)
+    all_indices = np.concatenate([np.asarray(neighbors.indices), own], axis=1)
+    all_mask = np.pad(np.asarray(neighbors.mask), ((0, 0), (0, widest - k)))
+    changed = chosen != k
+    where = rows[changed]
+    all_mask[where] = (mask & _first(chosen[:, None], mask))[changed, :widest]
+    all_indices[where] = np.where(all_mask[where], indices[changed, :widest], where[:, None])
+
+    def put(old, new):
+        full = np.array(_wider(old, widest))
+        full[..., where] = (new[:widest] if new.ndim > 1 else new)[..., changed]
+        return jnp.asarray(full)
+
+    leaves = [put(old, new) for old, new in zip(jax.tree.leaves(found), kept)]
+    chosen_weights = jax.tree.unflatten(jax.tree.structure(found), leaves)
+    return Neighbors(jnp.asarray(all_indices), jnp.asarray(all_mask)), chosen_weights
+
+
+def _wider(values, width: int) -> np.ndarray:
+    """Weights with more slots; diagnostics, which have none, as they are."""
+    values = np.asarray(values)
+    return values if values.ndim == 1 else np.pad(values, ((0, width - len(values)), (0, 0)))
+
+
+def _in_chunks(cloud, indices, mask, method, rows):
+    """Weights and diagnostics of the Laplacian of some rows, on the host."""
+    parts = []
+    for start in range(0, len(rows), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        some = Rows(jnp.asarray(indices[part]), jnp.asarray(mask[part]))
+        parts.append(stencil_weights(cloud, some, method, Laplacian(), jnp.asarray(rows[part])))
+    return jax.tree.map(lambda *a: np.concatenate([np.asarray(b) for b in a], axis=-1), *parts)
+
+
+def _report(poor, best, border, chosen, method) -> None:
+    """Warn of points inside the surface where no size serves."""
+    failed = (best < _DOMINANCE) & ~border[poor]
+    if failed.any():
+        worst = np.flatnonzero(failed)[np.argmin(best[failed])]
+        warnings.warn(
+            f"no neighbourhood of {failed.sum()} points serves {method}: the worst is point "
+            f"{poor[worst]}, where the centre has a share of {best[worst]:.2g} of the weights of "
+            f"{chosen[worst]} neighbours, {_DOMINANCE} is needed; the operator may have growing "
+            "modes (js.spectral_estimate)",
+            stacklevel=4,
+        )
 
 
 def _first(count, mask: np.ndarray) -> np.ndarray:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import cKDTree
 
-from .arguments import as_float, is_concrete, raise_at
+from .arguments import as_float, is_array, is_concrete, mask, raise_at
+
+# How far the length of a normal may be from one, by the bytes of a number: what normals that were
+# written with eight digits, or normalised in single precision, are off.
+_LENGTH = {2: 1e-2, 4: 1e-5, 8: 1.49e-6}
 
 
 class PointCloud(eqx.Module):
@@ -27,8 +31,11 @@ class PointCloud(eqx.Module):
             let operators derive it from the neighbours.
 
     Raises:
-        ValueError: wrong shapes; on concrete arrays also non-finite points and normals that
-            are not of length one, named by index.
+        TypeError: points, normals or spacing that are not real numbers, a border or activity
+            that is no mask of bools.
+        ValueError: wrong shapes, fewer than one point; on concrete arrays also points that are not
+            finite, and so large or so close that squared distances leave the range of their type,
+            normals that are not of length one, all named by index.
     """
 
     points: Float[Array, "n d"]
@@ -46,36 +53,74 @@ class PointCloud(eqx.Module):
         active: Bool[Array, " n"] | None = None,
         spacing: Float[Array, " n"] | None = None,
     ):
-        self.points = as_float(points)
-        self.normals = jnp.asarray(normals, self.points.dtype)
-        self.boundary = None if boundary is None else jnp.asarray(boundary, bool)
-        self.active = None if active is None else jnp.asarray(active, bool)
-        self.spacing = None if spacing is None else jnp.asarray(spacing, self.points.dtype)
-
-    def __check_init__(self):
+        self.points = as_float(points, "points")
+        dtype = self.points.dtype
         shape = self.points.shape
         if len(shape) != 2 or shape[1] not in (2, 3):
             raise ValueError(f"points must have shape (n, 2) or (n, 3), not {shape}")
+        if shape[0] < 1:
+            raise ValueError(f"points have shape {shape}: 0 points, at least 1 is needed")
+        self.normals = as_float(normals, "normals").astype(dtype)
+        self.boundary = None if boundary is None else mask(boundary, shape[0], "boundary")
+        self.active = None if active is None else mask(active, shape[0], "active")
+        self.spacing = None if spacing is None else as_float(spacing, "spacing").astype(dtype)
+
+    def __check_init__(self):
+        if not (is_array(self.points) and is_array(self.normals)):
+            return
+        shape = self.points.shape
         if self.normals.shape != shape:
             raise ValueError(f"normals have shape {self.normals.shape}, points {shape}")
-        for name in ("boundary", "active", "spacing"):
-            value = getattr(self, name)
-            if value is not None and value.shape != shape[:1]:
-                raise ValueError(f"{name} has shape {value.shape}, expected {shape[:1]}")
+        if self.spacing is not None and self.spacing.shape != shape[:1]:
+            raise ValueError(f"spacing has shape {self.spacing.shape}, expected {shape[:1]}")
         if is_concrete(self.points, self.normals, self.active, self.spacing):
             self._check_values()
 
     def _check_values(self):
         on = self.host_active
         points, normals = np.asarray(self.points), np.asarray(self.normals)
+        info = np.finfo(points.dtype)
         raise_at(on & ~np.isfinite(points).all(axis=1), "point {i} is not finite: {v}", points)
-        length = np.linalg.norm(normals, axis=1)
-        off = ~(np.abs(length - 1) < 100 * np.sqrt(np.finfo(points.dtype).eps))
-        raise_at(on & off, "normal {i} has length {v}, expected 1", length)
+        size, largest = np.abs(points).max(axis=1), float(info.max) ** 0.25
+        raise_at(
+            on & (size > largest),
+            f"point {{i}} has a coordinate of size {{v:.3g}}, at most {largest:.1g} can be "
+            f"calculated with in {points.dtype}: use other units",
+            size,
+        )
+        seen = points[on]
+        extent = float(np.ptp(seen, axis=0).max(initial=0))
+        least = float(info.tiny) ** 0.25
+        if 0 < extent < least:
+            raise ValueError(
+                f"points lie within {extent:.3g} of each other, at least {least:.1g} can be "
+                f"calculated with in {points.dtype}: use other units"
+            )
+        length = np.sqrt(np.sum(np.square(normals, dtype=float), axis=1))
+        off = ~(np.abs(length - 1) < _LENGTH[points.dtype.itemsize])
+        raise_at(on & off, "normal {i} has length {v:.9g}, expected 1", length)
         if self.spacing is not None:
             spacing = np.asarray(self.spacing)
             bad = ~(np.isfinite(spacing) & (spacing > 0))
             raise_at(on & bad, "spacing of point {i} is {v}, expected a positive number", spacing)
+
+    def __repr__(self):
+        if not is_array(self.points):
+            return f"PointCloud({self.points!r})"
+        about = [f"{self.n:,} points in {self.dim}-d", str(self.points.dtype)]
+        if is_concrete(self.points, self.active) and self.points.ndim == 2:
+            points = np.asarray(self.points, float)[self.host_active]
+            if len(points) > 1:
+                some = points[:: max(1, len(points) // 1000)]
+                nearest = cKDTree(points).query(some, [2])[0]
+                about.append(f"spacing {np.median(nearest):.3g}")
+            if len(points) < self.n:
+                about.append(f"{self.n - len(points):,} switched off")
+        if self.boundary is None:
+            about.append("closed")
+        elif is_concrete(self.boundary):
+            about.append(f"{int(np.sum(np.asarray(self.boundary))):,} on the border")
+        return f"PointCloud({', '.join(about)})"
 
     @property
     def n(self) -> int:

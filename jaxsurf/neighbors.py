@@ -11,7 +11,17 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from .arguments import is_concrete, raise_at
+from .arguments import (
+    as_float,
+    finite,
+    instance,
+    is_array,
+    is_concrete,
+    point_indices,
+    raise_at,
+    real,
+    whole,
+)
 from .checks import (
     LINK,
     RINGS,
@@ -40,11 +50,63 @@ class Neighbors(eqx.Module):
         mask: `(n, k)`, True where a slot holds a neighbour.
         radius: the search radius, scalar or `(n,)`, for lists made with a radius: operators
             then let their kernels vanish smoothly there. None for the k nearest.
+
+    Raises:
+        TypeError: indices that are not integers, a mask that is not bool.
+        ValueError: shapes that do not fit; on concrete arrays also an index that is no point, a
+            slot 0 that is not the point itself, a mask that leaves nothing.
     """
 
     indices: Int[Array, "n k"]
     mask: Bool[Array, "n k"]
     radius: Float[Array, "*n"] | None = None
+
+    def __check_init__(self):
+        if not (is_array(self.indices) and is_array(self.mask)):
+            for name in ("indices", "mask"):
+                value = getattr(self, name)
+                if isinstance(value, list | tuple | str | int | float | None.__class__):
+                    raise TypeError(f"{name} is a {type(value).__name__}, expected an array (n, k)")
+            return  # a pytree of something else, as transformations make them
+        point_indices(self.indices, "indices", axes="(n, k)", n=0)
+        if self.mask.dtype != bool:
+            raise TypeError(f"mask is {self.mask.dtype}, expected bool")
+        if self.mask.shape != self.indices.shape:
+            raise ValueError(f"mask has shape {self.mask.shape}, indices {self.indices.shape}")
+        if is_concrete(self.indices, self.mask):
+            first, used = np.asarray(self.indices)[:, 0], np.asarray(self.mask)
+            raise_at(
+                first != np.arange(self.n), "slot 0 of row {i} names point {v}, expected {i}", first
+            )
+            if not used.any():
+                raise ValueError(f"mask is False in all {used.size} slots: no point has neighbours")
+            raise_at(
+                used.any(axis=1) & ~used[:, 0],
+                "mask of row {i} leaves out the point itself in slot 0 but takes {v} others",
+                used.sum(axis=1),
+            )
+        radius = self.radius
+        if radius is not None and is_array(radius):
+            if radius.shape not in ((), (self.n,)):
+                raise ValueError(f"radius has shape {radius.shape}, expected () or ({self.n},)")
+            if is_concrete(radius):
+                reach = np.broadcast_to(np.asarray(radius), self.n)
+                text = "radius of point {i} is {v}, expected a positive number"
+                raise_at(~(np.isfinite(reach) & (reach > 0)), text, reach)
+
+    def __repr__(self):
+        about = f"{self.n:,} points, {self.k} slots"
+        if is_concrete(self.indices, self.mask):
+            count = np.asarray(self.mask).sum(axis=1)
+            count = count[count > 0]
+            low, high = count.min(initial=self.k), count.max(initial=0)
+            about += f", {low} neighbours each" if low == high else f", {low} to {high} neighbours"
+            about += f", {self.n - len(count)} rows off" if len(count) < self.n else ""
+            if self.radius is not None and is_concrete(self.radius):
+                reach = np.asarray(self.radius)
+                about += f" within {reach.min():.3g}"
+                about += f" to {reach.max():.3g}" if reach.max() > reach.min() else ""
+        return f"Neighbors({about})"
 
     @property
     def n(self) -> int:
@@ -53,6 +115,17 @@ class Neighbors(eqx.Module):
     @property
     def k(self) -> int:
         return self.indices.shape[1]
+
+
+class Rows(eqx.Module):
+    """Lists of some rows only, or of points that are not in slot 0: what weights are made from.
+
+    No promise is checked.
+    """
+
+    indices: Int[Array, "r k"]
+    mask: Bool[Array, "r k"]
+    radius: Float[Array, "*r"] | None = None
 
 
 def find_neighbors(
@@ -92,6 +165,7 @@ def find_neighbors(
 
     Differentiable: the lists are integers; operators are differentiable for fixed lists.
     Raises:
+        TypeError: no cloud or array of points; k or capacity that are not whole numbers.
         ValueError: traced arrays (use `search_neighbors`); k, radius or capacity out of range
             (both numbers given); duplicates, lone points, mixed orientation and sheets too
             close to be told apart (named by index).
@@ -111,9 +185,17 @@ def find_neighbors(
         )
     if k is not None and capacity is not None:
         raise ValueError("capacity belongs to a search by radius; with k the rows have k slots")
+    if k is not None:
+        k = whole(k, "k")
+    if capacity is not None:
+        capacity = whole(capacity, "capacity", least=1)
+    real(min_cosine, "min_cosine", least=-1, most=1)
     surface = isinstance(cloud, PointCloud)
     if not isinstance(cloud, PointCloud):
-        cloud = PointCloud(cloud, jnp.zeros_like(cloud).at[:, 0].set(1))
+        flat = as_float(cloud, "cloud")
+        if flat.ndim != 2 or flat.shape[1] not in (2, 3):
+            raise ValueError(f"points must have shape (n, 2) or (n, 3), not {flat.shape}")
+        cloud = PointCloud(flat, jnp.zeros_like(flat).at[:, 0].set(1))
     on = cloud.host_active
     rows = np.flatnonzero(on)
     points = np.asarray(cloud.points)[rows]
@@ -127,7 +209,10 @@ def find_neighbors(
     if k is not None:
         slots, mask = nearest(points, normals, tree, k, min_cosine)
     else:
-        reach = np.broadcast_to(np.asarray(radius, points.dtype), cloud.n)
+        given = finite(as_float(radius, "radius"), "radius")
+        if given.shape not in ((), (cloud.n,)):
+            raise ValueError(f"radius has shape {given.shape}, expected () or ({cloud.n},)")
+        reach = np.broadcast_to(np.asarray(given, points.dtype), cloud.n)
         raise_at(on & ~(reach > 0), "radius of point {i} is {v}, expected a positive number", reach)
         slots, mask = _within(points, normals, tree, reach[rows], capacity, min_cosine, rows)
     if surface:
@@ -337,13 +422,22 @@ def tube_ratio(cloud: PointCloud, neighbors: Neighbors) -> Float[Array, " n"]:
         0.5
     """
 
+    instance(cloud, PointCloud, "cloud")
+    instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
+    if neighbors.n != cloud.n:
+        raise ValueError(f"neighbors of {neighbors.n} points, the cloud has {cloud.n}")
+    return _bend(cloud.points, cloud.normals, neighbors.indices.T, neighbors.mask.T)
+
+
+@jax.jit
+def _bend(points, normals, slots, masks):
     # One column of neighbours at a time: nothing of size (n, k, d) is stored.
-    def bend(slot, mask):
-        d = cloud.points[slot] - cloud.points
+    def bend(column):
+        slot, mask = column
+        d = points[slot] - points
         squared = jnp.sum(d * d, axis=1)
         used = mask & (squared > 0)
-        turn = jnp.sum(d * (cloud.normals[slot] - cloud.normals), axis=1)
+        turn = jnp.sum(d * (normals[slot] - normals), axis=1)
         return jnp.where(used, jnp.abs(turn) / jnp.where(used, squared, 1), 0)
 
-    ratios = jax.lax.map(lambda column: bend(*column), (neighbors.indices.T, neighbors.mask.T))
-    return jnp.max(ratios, axis=0)
+    return jnp.max(jax.lax.map(bend, (slots, masks)), axis=0)

@@ -2,9 +2,12 @@ r"""Differential operators on point clouds: on surfaces, and in flat space."""
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from .arguments import as_float, finite, instance, is_concrete, raise_at, whole
 from .build import build
 from .cloud import PointCloud
 from .neighbors import Neighbors, find_neighbors
@@ -35,12 +38,15 @@ def laplace_beltrami(
 
     Returns:
         Operator mapping `(n,)` or `(n, c)` fields to the same shape, in units of
-        field / length². Its eigenvalues have real parts ≤ 0.
+        field / length². The eigenvalues of the surface's operator are real and ≤ 0; those of this
+        one, which is not symmetric, approximate them, and a few of large size may come out with
+        a positive real part where points are few or uneven: `js.spectral_estimate` tells.
 
     Accuracy: error $O(h^r)$ for `DCPSE(order=r)`, $O(h^{p-1})$ for `GFDM(degree=p)`
     (`tests/test_accuracy.py`).
     Differentiable: forward and reverse, in points, normals and field, for fixed neighbours.
     Raises:
+        TypeError: no cloud, neighbours or method.
         ValueError: fewer neighbours than basis functions (both numbers given), or a stencil
             whose conditions cannot be met (point, residual and count given).
 
@@ -126,7 +132,7 @@ def surface_divergence(
 
 def directional_derivative(
     cloud: PointCloud,
-    direction: Float[Array, "n d"],
+    direction: Float[Array, "*n d"],
     *,
     neighbors: Neighbors | None = None,
     method: AbstractMethod = DCPSE(order=2),
@@ -147,11 +153,12 @@ def directional_derivative(
     Accuracy: as `surface_gradient`.
     Differentiable: forward and reverse, in points, normals, direction and field.
     Raises:
-        ValueError: as `laplace_beltrami`; a direction of the wrong shape.
+        ValueError: as `laplace_beltrami`; a direction of the wrong shape or not finite.
     """
+    instance(cloud, PointCloud, "cloud")
+    direction = finite(_field(direction, (cloud.n, cloud.dim), "direction"), "direction")
     gradient = build(cloud, neighbors, method, Gradient(), throw)
-    direction = _field(direction, (cloud.n, cloud.dim), "direction")
-    weights = jnp.einsum("na,kan->kn", direction, gradient.weights)
+    weights = _along(direction.astype(gradient.weights.dtype), gradient.weights)
     return Stencil(gradient.indices, weights, (), (), gradient.diagnostics, gradient.border)
 
 
@@ -174,8 +181,8 @@ def diffusion(
 
     Args:
         cloud: n points in d dimensions with unit normals.
-        diffusivity: D, scalar `(n,)` or symmetric tensor `(n, d, d)`; of a tensor only the
-            tangential part counts.
+        diffusivity: D, scalar `(n,)` or symmetric tensor `(n, d, d)`, neither negative; of a
+            tensor only the tangential part counts. Taken in the precision of the cloud.
         neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
         method: how the weights are computed.
         throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
@@ -186,23 +193,73 @@ def diffusion(
     Accuracy: the order of the Laplace–Beltrami operator of the same method.
     Differentiable: forward and reverse, in points, normals, diffusivity and field.
     Raises:
-        ValueError: as `laplace_beltrami`; a diffusivity of the wrong shape.
+        ValueError: as `laplace_beltrami`; a diffusivity of the wrong shape; a concrete one that
+            is not finite, negative, not symmetric or not positive semidefinite (point and number
+            given).
+
+    Example:
+        >>> cloud = js.sphere(500)
+        >>> z = cloud.points[:, 2]
+        >>> bool(jnp.abs(js.diffusion(cloud, jnp.full(500, 3.0))(z) + 6 * z).max() < 0.5)
+        True
     """
-    d = jnp.asarray(diffusivity)
-    if d.shape == (cloud.n,):
-        stencil = build(cloud, neighbors, method, Laplacian(), throw)
-        weights = stencil.weights * (d + d[stencil.indices]) / 2
-    elif d.shape == (cloud.n, cloud.dim, cloud.dim):
-        stencil = build(cloud, neighbors, method, Hessian(), throw)
-        project = jnp.eye(cloud.dim) - cloud.normals[:, :, None] * cloud.normals[:, None]
-        d = jnp.einsum("nab,nbc,ncd->nad", project, (d + d.mT) / 2, project)
-        mean = (d + d[stencil.indices]) / 2
-        weights = jnp.einsum("knab,kabn->kn", mean, stencil.weights)
-    else:
-        shapes = f"({cloud.n},) or ({cloud.n}, {cloud.dim}, {cloud.dim})"
-        raise ValueError(f"diffusivity has shape {d.shape}, expected {shapes}")
-    weights = weights.at[0].set(-jnp.sum(weights[1:], axis=0))
+    instance(cloud, PointCloud, "cloud")
+    d = _checked_diffusivity(diffusivity, cloud)
+    scalar = d.ndim == 1
+    stencil = build(cloud, neighbors, method, Laplacian() if scalar else Hessian(), throw)
+    weigh = _scalar_weights if scalar else _tensor_weights
+    weights = weigh(
+        d.astype(stencil.weights.dtype), cloud.normals, stencil.indices, stencil.weights
+    )
     return Stencil(stencil.indices, weights, (), (), stencil.diagnostics, stencil.border)
+
+
+def _checked_diffusivity(diffusivity, cloud) -> Float[Array, "*n"]:
+    d = as_float(diffusivity, "diffusivity")
+    n, dim = cloud.n, cloud.dim
+    if d.shape not in ((n,), (n, dim, dim)):
+        shapes = f"({n},) or ({n}, {dim}, {dim})"
+        raise ValueError(f"diffusivity has shape {d.shape}, expected {shapes}")
+    finite(d, "diffusivity")
+    if not is_concrete(d, cloud.active):
+        return d
+    values, on = np.asarray(d), cloud.host_active
+    if d.ndim == 1:
+        raise_at(on & (values < 0), "diffusivity of point {i} is {v}, expected at least 0", values)
+        return d
+    size = np.abs(values).max(axis=(1, 2))
+    slack = 1e3 * np.finfo(values.dtype).eps * size
+    skew = np.abs(values - values.swapaxes(1, 2)).max(axis=(1, 2))
+    text = "diffusivity of point {i} is not symmetric: entries differ by {v:.3g}, expected 0"
+    raise_at(on & (skew > slack), text, skew)
+    least = np.linalg.eigvalsh(values)[:, 0]
+    text = "diffusivity of point {i} has the eigenvalue {v:.3g}, expected at least 0"
+    raise_at(on & (least < -slack), text, least)
+    return d
+
+
+@jax.jit
+def _along(direction, weights):
+    return sum(a * w for a, w in zip(direction.T, jnp.moveaxis(weights, 1, 0)))
+
+
+@jax.jit
+def _scalar_weights(d, _, indices, weights):
+    return _closed(weights * (d + d[indices]) / 2)
+
+
+@jax.jit
+def _tensor_weights(d, normals, indices, weights):
+    project = jnp.eye(len(normals.T), dtype=d.dtype) - normals[:, :, None] * normals[:, None]
+    # Points last, and one entry at a time: nothing of size (k, n, d, d) is made but the stencils.
+    d = jnp.einsum("nab,nbc,ncd->adn", project, (d + d.mT) / 2, project)
+    entries = [(a, b) for a in range(len(d)) for b in range(len(d))]
+    return _closed(sum((d[a, b] + d[a, b][indices]) / 2 * weights[:, a, b] for a, b in entries))
+
+
+def _closed(weights):
+    """Rows that sum to zero, by the weight of the centre."""
+    return weights.at[0].set(-jnp.sum(weights[1:], axis=0))
 
 
 def biharmonic(
@@ -268,11 +325,17 @@ def partial_derivative(
         >>> bool(jnp.allclose(d_xy(points[:, 0] * points[:, 1]), 1))
         True
     """
-    points = jnp.asarray(points)
-    dim = points.shape[-1]
+    points = as_float(points, "points")
+    if points.ndim != 2 or points.shape[1] not in (2, 3):
+        raise ValueError(f"points must have shape (n, 2) or (n, 3), not {points.shape}")
+    instance(method, FlatDCPSE, "method")
+    dim = points.shape[1]
+    if not isinstance(alpha, tuple | list):
+        raise TypeError(f"alpha is {alpha!r}, expected {dim} whole numbers")
+    alpha = tuple(whole(a, "alpha") for a in alpha)
     if len(alpha) != dim or min(alpha) < 0 or sum(alpha) < 1:
         raise ValueError(f"alpha = {alpha} is no derivative in {dim} dimensions")
-    target = Partial(tuple(alpha))
+    target = Partial(alpha)
     if neighbors is None:
         count = min(method.neighbor_count(dim, target), len(points))
         neighbors = find_neighbors(points, count)
@@ -282,7 +345,7 @@ def partial_derivative(
 
 
 def _field(values, shape: tuple[int, ...], name: str):
-    values = jnp.asarray(values)
+    values = as_float(values, name)
     if values.shape not in (shape, shape[1:]):
         raise ValueError(f"{name} has shape {values.shape}, expected {shape}")
     return jnp.broadcast_to(values, shape)

@@ -48,7 +48,9 @@ class DCPSE(AbstractMethod):
     support: float | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self):
-        check_positive(self, "order", "width", "layers", "layer_spacing", "support")
+        check_positive(
+            self, order=True, width=False, layers=True, layer_spacing=False, support=False
+        )
 
     def neighbor_count(self, dim):
         return _SURFACE_COUNT[min(self.order, 6)] if dim == 3 else 7 + 2 * self.order
@@ -104,7 +106,7 @@ class FlatDCPSE(AbstractMethod):
     support: float | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self):
-        check_positive(self, "order", "width", "support")
+        check_positive(self, order=True, width=False, support=False)
 
     def neighbor_count(self, dim, target: AbstractTarget = Laplacian()):
         return 3 * self.basis_size(dim, target)

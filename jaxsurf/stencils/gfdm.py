@@ -44,7 +44,7 @@ class GFDM(AbstractMethod):
     support: float | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self):
-        check_positive(self, "degree", "width", "support")
+        check_positive(self, degree=True, width=False, support=False)
 
     def neighbor_count(self, dim):
         return _SURFACE_COUNT[min(self.degree, 6)] if dim == 3 else 5 + 2 * self.degree

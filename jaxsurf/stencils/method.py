@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..arguments import real, whole
 from .kernels import support
 from .targets import AbstractTarget
 
@@ -100,14 +101,21 @@ class AbstractMethod(eqx.Module):
         """How many stencils are computed at once: enough to be fast, few enough for the cache."""
 
 
-def check_positive(method: AbstractMethod, *names: str) -> None:
-    """Raise unless each of these settings is a positive number, or None."""
-    for name in names:
-        value = getattr(method, name)
-        if value is not None and not value > 0:
-            raise ValueError(
-                f"{type(method).__name__}: {name} = {value}, expected a positive number"
-            )
+def check_positive(method: AbstractMethod, **least: bool) -> None:
+    """Raise unless these settings are positive numbers (True: whole ones), or None where they may.
+
+    Raises:
+        TypeError: no number, or not a whole one.
+        ValueError: not positive or not finite.
+    """
+    for name, counted in least.items():
+        value, label = getattr(method, name), f"{type(method).__name__}: {name}"
+        if value is None and name not in ("order", "degree"):
+            continue
+        if counted:
+            whole(value, label, least=1)
+        else:
+            real(value, label, above=0)
 
 
 def with_center(eta: Float[Array, "c k *p"]) -> Float[Array, "c k *p"]:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import abc
 import functools
 import math
+import struct
+import zipfile
+import zlib
 from pathlib import Path
 
 import equinox as eqx
@@ -16,7 +19,7 @@ import scipy.sparse
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import is_concrete
+from ..arguments import as_float, instance, is_array, is_concrete, mask, point_indices, raise_at
 from .method import Diagnostics
 
 
@@ -61,6 +64,27 @@ class AbstractOperator(eqx.Module):
     def __matmul__(self, other: AbstractOperator) -> Composition:
         return Composition(self, other)
 
+    def checked(self, u: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
+        """A field that the operator takes, as an array; else an error."""
+        u = as_float(u, "field")
+        split = u.ndim - len(self.in_shape)
+        if split < 1 or u.shape[0] != self.n or u.shape[split:] != self.in_shape:
+            batch = "".join(f", {c}" for c in self.in_shape)
+            raise ValueError(
+                f"field has shape {u.shape}, expected ({self.n}{batch or ','}) or a batch "
+                f"({self.n}, c{batch})"
+            )
+        return u
+
+    @property
+    def _maps(self) -> str:
+        """What goes in and comes out, for `repr`."""
+        kinds = [
+            {0: "scalar", 1: "vector"}.get(len(s), "tensor")
+            for s in (self.in_shape, self.out_shape)
+        ]
+        return f"{self.n:,} points, {kinds[0]} to {kinds[1]} fields"
+
     def to_lineax(self, dtype=None) -> lx.FunctionLinearOperator:
         """The operator on one field, for the linear solvers of lineax."""
         dtype = jnp.result_type(float) if dtype is None else dtype
@@ -82,7 +106,14 @@ class Stencil(AbstractOperator):
         diagnostics: how well each stencil is determined; None if unknown.
         border: True at border points of the surface, `(n,)`; None if it has none.
 
+    A field of another precision than the weights is taken as JAX does: the result has the wider
+    of both. Integers count as floating-point numbers; complex fields are refused, and are two real
+    ones in a batch.
+
     Differentiable: forward and reverse, in the weights and in the field.
+    Raises:
+        TypeError: indices that are not integers, weights that are not real floating-point numbers.
+        ValueError: shapes that do not fit; on concrete arrays an index that is no point.
     """
 
     indices: Int[Array, "k n"]
@@ -93,9 +124,27 @@ class Stencil(AbstractOperator):
     border: Bool[Array, " n"] | None = None
 
     def __check_init__(self):
-        shape = (self.k, *self.out_shape, *self.in_shape, self.n)
-        if self.weights.shape != shape:
-            raise ValueError(f"weights have shape {self.weights.shape}, expected {shape}")
+        if not is_array(self.indices):
+            return  # a pytree of something else, as transformations make them
+        point_indices(self.indices, "indices", axes="(k, n)", n=-1)
+        weights = self.weights
+        if is_array(weights):
+            if not jnp.issubdtype(weights.dtype, jnp.floating):
+                raise TypeError(f"weights are {weights.dtype}, expected floating-point numbers")
+            shape = (self.k, *self.out_shape, *self.in_shape, self.n)
+            if weights.shape != shape:
+                raise ValueError(f"weights have shape {weights.shape}, expected {shape}")
+            if self.diagnostics is None and is_concrete(weights):
+                # Those with diagnostics were looked at when they were built, or were not to be.
+                bad = ~np.isfinite(np.asarray(weights)).reshape(-1, self.n).all(axis=0)
+                raise_at(bad, "weights of point {i} are not finite", np.asarray(bad))
+        if is_array(self.border):
+            mask(self.border, self.n, "border")
+
+    def __repr__(self):
+        filled = "" if self.diagnostics is None else f" ({_counts(self.diagnostics.count)} used)"
+        dtype = getattr(self.weights, "dtype", type(self.weights).__name__)
+        return f"Stencil({self._maps}, {self.k} slots{filled}, {dtype})"
 
     @property
     def n(self) -> int:
@@ -107,18 +156,7 @@ class Stencil(AbstractOperator):
         return self.indices.shape[0]
 
     def __call__(self, u):
-        u = jnp.asarray(u)
-        split = u.ndim - len(self.in_shape)
-        if split < 1 or u.shape[0] != self.n or u.shape[split:] != self.in_shape:
-            raise ValueError(
-                f"field has shape {u.shape}, expected ({self.n}, ...) and then {self.in_shape}"
-            )
-        batch = u.shape[1:split]
-        # A single column is gathered alone; of several, whole rows.
-        values = u if u.ndim == 1 else u.reshape(self.n, -1, *self.in_shape)
-        total = _sum_slots(self.weights, self.indices, values, len(self.in_shape))
-        total = jnp.moveaxis(total, 0, -1) if self.out_shape else total
-        return total.reshape(self.n, *batch, *self.out_shape)
+        return _apply(self.weights, self.indices, self.checked(u), len(self.in_shape))
 
     def transpose(self) -> Stencil:
         """The transposed stencil, again with one gather per slot.
@@ -126,17 +164,16 @@ class Stencil(AbstractOperator):
         The indices must be concrete (they decide the number of slots, the largest number of
         stencils that any point is part of); the weights may be traced.
         """
+        if not is_concrete(self.indices):
+            raise ValueError("transpose needs concrete indices: they decide the number of slots")
         slots, order = _incoming(np.asarray(self.indices))
         source = np.broadcast_to(np.arange(self.n), self.indices.shape).ravel()[order]
         place, row = slots
-        k = int(place.max()) + 1
+        # Rounded up, so that operators of one size on one geometry and another share programs.
+        k = -(-(int(place.max()) + 1) // 8) * 8
         indices = np.broadcast_to(np.arange(self.n, dtype=np.int32), (k, self.n)).copy()
         indices[place, row] = source
-        flat = jnp.moveaxis(self.weights, -1, 1).reshape(self.k * self.n, *self.weights.shape[1:-1])
-        moved = jnp.zeros((k, self.n, *self.weights.shape[1:-1]), self.weights.dtype)
-        moved = jnp.moveaxis(moved.at[place, row].set(flat[order]), 1, -1)
-        if self.out_shape and self.in_shape:
-            moved = jnp.swapaxes(moved, 1, 2)
+        moved = _moved(self.weights, order, place, row, k, len(self.in_shape))
         shapes = (self.in_shape, self.out_shape)
         return Stencil(jnp.asarray(indices), moved, *shapes, border=self.border)
 
@@ -155,18 +192,41 @@ class Stencil(AbstractOperator):
     @property
     def diagonal(self) -> Float[Array, "*c n"]:
         """The weight of every point in its own row, `(*out_shape, *in_shape, n)`."""
-        own = self.indices == jnp.arange(self.n, dtype=self.indices.dtype)
-        own = own.reshape(self.k, *[1] * (self.weights.ndim - 2), self.n)
-        return jnp.sum(jnp.where(own, self.weights, 0), axis=0)
+        return _diagonal(self.weights, self.indices)
 
     def scaled(self, factor: Float[Array, " n"] | float) -> Stencil:
         """The operator with row i multiplied by `factor[i]`."""
+        factor = _per_point(factor, self.n, "factor", self.weights.dtype)
         return eqx.tree_at(lambda s: s.weights, self, self.weights * factor)
 
     def shifted(self, term: Float[Array, " n"] | float) -> Stencil:
-        """The operator plus `term[i]` times the value at point i: the identity times a number."""
+        """The operator plus `term[i]` times the value at point i: the identity times a number.
+
+        The term goes to the first slot that holds the point itself. If a row has none, as rows of
+        a transpose may, one more slot is added; which needs concrete indices.
+        """
         check_scalar(self)
-        return eqx.tree_at(lambda s: s.weights, self, self.weights.at[0].add(term))
+        term = _per_point(term, self.n, "term", self.weights.dtype)
+        indices, weights = self.indices, self.weights
+        if is_concrete(indices):
+            own = np.asarray(indices) == np.arange(self.n)
+            slot = own.argmax(axis=0)
+            lacking = ~own.any(axis=0)
+            if lacking.any():
+                centre = np.arange(self.n, dtype=indices.dtype)
+                indices = jnp.concatenate([indices, centre[None]])
+                weights = jnp.pad(weights, ((0, 1), (0, 0)))
+                slot = np.where(lacking, self.k, slot)
+        else:
+            own = indices == jnp.arange(self.n, dtype=indices.dtype)
+            slot = jnp.argmax(own, axis=0)
+            weights = eqx.error_if(
+                weights,
+                ~own.any(),
+                "a row has no slot for its own point: make the shifted operator outside jit",
+            )
+        weights = weights.at[slot, np.arange(self.n)].add(term)
+        return eqx.tree_at(lambda s: (s.indices, s.weights), self, (indices, weights))
 
     def save(self, path: str | Path) -> None:
         """Write indices and weights to a NumPy archive (`.npz`, no pickle)."""
@@ -191,18 +251,28 @@ class Stencil(AbstractOperator):
             ValueError: the file is not such an archive.
         """
         try:
-            archive = np.load(path, allow_pickle=False)
-            data = {name: archive[name] for name in archive.files}
+            with np.load(path, allow_pickle=False) as archive:
+                data = {name: archive[name] for name in archive.files}
             out_shape, in_shape = (
                 tuple(data.pop(name).tolist()) for name in ("out_shape", "in_shape")
             )
             indices, weights = jnp.asarray(data.pop("indices")), jnp.asarray(data.pop("weights"))
-        except (OSError, EOFError, KeyError, ValueError, AttributeError) as error:
+            border = jnp.asarray(data.pop("border")) if "border" in data else None
+            extra = {name: jnp.asarray(value) for name, value in data.items()}
+            diagnostics = Diagnostics(**extra) if extra else None
+            return cls(indices, weights, out_shape, in_shape, diagnostics, border)
+        except FileNotFoundError:
+            raise
+        except _DAMAGE as error:
             raise ValueError(f"{path} does not hold a stencil: {error}") from error
-        border = jnp.asarray(data.pop("border")) if "border" in data else None
-        extra = {name: jnp.asarray(value) for name, value in data.items()}
-        diagnostics = Diagnostics(**extra) if extra else None
-        return cls(indices, weights, out_shape, in_shape, diagnostics, border)
+
+
+# What reading a file that was cut off or changed can end in.
+_DAMAGE = (
+    OSError, EOFError, KeyError, IndexError, ValueError, TypeError, AttributeError, SyntaxError,
+    OverflowError, MemoryError, NotImplementedError, RuntimeError, struct.error, zlib.error,
+    zipfile.BadZipFile,
+)  # fmt: skip
 
 
 class Composition(AbstractOperator):
@@ -212,6 +282,8 @@ class Composition(AbstractOperator):
     inner: AbstractOperator
 
     def __check_init__(self):
+        for name in ("outer", "inner"):
+            instance(getattr(self, name), AbstractOperator, name)
         have = (self.inner.n, self.inner.out_shape)
         want = (self.outer.n, self.outer.in_shape)
         if have != want:
@@ -235,6 +307,9 @@ class Composition(AbstractOperator):
         either = (np if is_concrete(*marked) else jnp).logical_or
         return functools.reduce(either, marked) if marked else None
 
+    def __repr__(self):
+        return f"Composition({self._maps}, of {self.outer!r} after {self.inner!r})"
+
     def __call__(self, u):
         return self.outer(self.inner(u))
 
@@ -252,8 +327,55 @@ def check_scalar(operator: AbstractOperator) -> None:
         raise ValueError(f"an operator on scalar fields is needed, not from {shapes} components")
 
 
+def _per_point(value, n: int, name: str, dtype):
+    """A number or one number per point, in the precision of the operator."""
+    value = as_float(value, name)
+    if value.shape not in ((), (n,)):
+        raise ValueError(f"{name} has shape {value.shape}, expected () or ({n},)")
+    return value.astype(dtype)
+
+
+def _counts(count) -> str:
+    """Least and largest of counts per point, in words."""
+    if not is_concrete(count) or not np.size(count):
+        return "some"
+    count = np.asarray(count)
+    low, high = count[count > 0].min(initial=count.max()), count.max()
+    return f"{low}" if low == high else f"{low} to {high}"
+
+
 # Slots added up in one pass over the memory of the result.
 _GROUP = 10
+
+
+# Compiled once for each shape, not at every call outside jit.
+@functools.partial(jax.jit, static_argnums=3)
+def _apply(weights, indices, u, contracted: int):
+    n, components = len(u), u.shape[u.ndim - contracted :]
+    batch = u.shape[1 : u.ndim - contracted]
+    # A single column is gathered alone; of several, whole rows.
+    values = u if u.ndim == 1 else u.reshape(n, -1, *components)
+    total = _sum_slots(weights, indices, values, contracted)
+    out_shape = weights.shape[1 : weights.ndim - 1 - contracted]
+    total = jnp.moveaxis(total.reshape(*out_shape, n, -1), -2, 0)
+    return jnp.moveaxis(total, -1, 1).reshape(n, *batch, *out_shape)
+
+
+@jax.jit
+def _diagonal(weights, indices):
+    own = indices == jnp.arange(indices.shape[1], dtype=indices.dtype)
+    own = own.reshape(len(own), *[1] * (weights.ndim - 2), -1)
+    return jnp.sum(jnp.where(own, weights, 0), axis=0)
+
+
+@functools.partial(jax.jit, static_argnums=(4, 5))
+def _moved(weights, order, place, row, k: int, contracted: int):
+    """The weights in the order of the transpose, with the components taken and given exchanged."""
+    components, n = weights.shape[1:-1], weights.shape[-1]
+    flat = jnp.moveaxis(weights, -1, 1).reshape(len(weights) * n, *components)
+    moved = jnp.zeros((k, n, *components), weights.dtype).at[place, row].set(flat[order])
+    moved = jnp.moveaxis(moved, 1, -1)
+    return jnp.swapaxes(moved, 1, 2) if 0 < contracted < len(components) else moved
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3,))

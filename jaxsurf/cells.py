@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .arguments import is_concrete
+from .arguments import as_float, finite, instance, is_concrete, mask, real, whole
 from .neighbors import Neighbors, cosine_slack
 
 # Cells are a little wider than the radius, so that rounding puts no neighbour two cells away.
@@ -97,7 +98,9 @@ def allocate(
         Number of slots and of candidates. Whatever the normals reject is counted too.
 
     Raises:
-        ValueError: traced points, or a radius that is not positive.
+        TypeError: points or numbers that are none.
+        ValueError: traced points or points that are not finite, a radius that is not positive, a
+            margin below 1.
 
     Example:
         >>> x = jnp.stack([jnp.arange(10.0), jnp.zeros(10)], axis=1)
@@ -106,9 +109,9 @@ def allocate(
     """
     if not is_concrete(points, active):
         raise ValueError("allocate needs concrete points: call it outside jit")
-    if not radius > 0:
-        raise ValueError(f"radius is {radius}, expected a positive number")
-    points = jnp.asarray(points)
+    points = _checked_points(points, active)
+    real(radius, "radius", above=0)
+    real(margin, "margin", least=1)
     on = _all_on(points, active)
     candidates = int(jax.jit(_candidates)(points, radius, on)[1].sum(axis=1).max())
     x = np.asarray(points, float)[np.asarray(on)]
@@ -117,7 +120,6 @@ def allocate(
     return SearchCapacity(min(n, math.ceil(margin * k)), min(n, math.ceil(margin * candidates)))
 
 
-@eqx.filter_jit
 def search_neighbors(
     points: Float[Array, "n d"],
     *,
@@ -155,7 +157,9 @@ def search_neighbors(
 
     Differentiable: the lists are integers; no derivative flows through the search.
     Raises:
-        ValueError: normals or k that do not fit (both numbers given).
+        TypeError: points, numbers or a capacity that are none.
+        ValueError: normals or k that do not fit (both numbers given); on concrete arrays a radius
+            or a cosine out of range.
         RuntimeError: capacity exceeded and `throw`.
 
     Example:
@@ -164,15 +168,32 @@ def search_neighbors(
         >>> neighbors.indices[4, :5].tolist(), int(report.k_needed)
         ([4, 3, 5, 2, 6], 5)
     """
-    n, _ = points.shape
-    if normals is not None and normals.shape != points.shape:
-        raise ValueError(f"normals have shape {normals.shape}, points {points.shape}")
-    slots = capacity.k if k is None else k
-    if k is not None and not 2 <= k <= capacity.candidates:
-        raise ValueError(f"k = {k} neighbours, 2 to {capacity.candidates} candidates allowed")
+    points = _checked_points(points, active)
+    instance(capacity, SearchCapacity, "capacity", "see allocate")
+    if normals is not None:
+        normals = as_float(normals, "normals")
+        if normals.shape != points.shape:
+            raise ValueError(f"normals have shape {normals.shape}, points {points.shape}")
+    if k is not None:
+        k = whole(k, "k")
+        if not 2 <= k <= capacity.candidates:
+            raise ValueError(f"k = {k} neighbours, 2 to {capacity.candidates} candidates allowed")
+    real(radius, "radius", above=0)
+    real(min_cosine, "min_cosine", least=-1, most=1)
+    # Numbers go in as arrays: another value compiles nothing.
+    numbers = (jnp.asarray(value, points.dtype) for value in (radius, min_cosine))
+    slots, batch_size = capacity.k if k is None else k, whole(batch_size, "batch_size", least=1)
+    return _search(points, *numbers, normals, active, capacity, k, slots, throw, batch_size)
+
+
+@functools.partial(jax.jit, static_argnums=(5, 6, 7, 8, 9))
+def _search(
+    points, radius, min_cosine, normals, active, capacity, k, slots, throw, batch_size
+) -> tuple[Neighbors, SearchReport]:
+    n = len(points)
     points = jax.lax.stop_gradient(points)
     normals = None if normals is None else jax.lax.stop_gradient(normals)
-    radius = jax.lax.stop_gradient(jnp.asarray(radius, points.dtype))
+    radius = jax.lax.stop_gradient(radius)
     on = _all_on(points, active)
     start, length, order = _candidates(points, radius, on)
     limit = _distance_key(radius * radius)
@@ -223,6 +244,19 @@ def search_neighbors(
             "give the numbers needed",
         )
     return neighbors, report
+
+
+def _checked_points(points, active) -> Float[Array, "n d"]:
+    points = as_float(points, "points")
+    if points.ndim != 2 or points.shape[1] not in (2, 3) or not len(points):
+        raise ValueError(
+            f"points must have shape (n, 2) or (n, 3), n at least 1, not {points.shape}"
+        )
+    if active is not None:
+        mask(active, len(points), "active")
+    if is_concrete(points, active):
+        finite(points if active is None else points[np.asarray(active)], "points")
+    return points
 
 
 def _all_on(points, active) -> Bool[Array, " n"]:

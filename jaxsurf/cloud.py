@@ -98,7 +98,7 @@ class PointCloud(eqx.Module):
             )
         length = np.sqrt(np.sum(np.square(normals, dtype=float), axis=1))
         off = ~(np.abs(length - 1) < _LENGTH[points.dtype.itemsize])
-        raise_at(on & off, "normal {i} has length {v:.9g}, expected 1", length)
+        raise_at(on & off, "normal {i} has length {v}, expected 1", np.round(length, 7))
         if self.spacing is not None:
             spacing = np.asarray(self.spacing)
             bad = ~(np.isfinite(spacing) & (spacing > 0))

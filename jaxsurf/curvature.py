@@ -5,9 +5,11 @@ Signs: on the unit sphere with outward normals the principal curvatures are +1.
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .arguments import instance
 from .cloud import PointCloud
 from .frames import frames_of
 from .neighbors import Neighbors
@@ -40,9 +42,12 @@ def shape_tensor(
         ValueError: as `surface_gradient`.
     """
     gradient = surface_gradient(cloud, neighbors, method=method)
-    tensor = gradient(cloud.normals)
-    n = cloud.normals
-    project = jnp.eye(cloud.dim, dtype=n.dtype) - n[:, :, None] * n[:, None]
+    return _symmetric(gradient(cloud.normals), cloud.normals)
+
+
+@jax.jit
+def _symmetric(tensor, n):
+    project = jnp.eye(n.shape[1], dtype=n.dtype) - n[:, :, None] * n[:, None]
     tensor = jnp.einsum("nab,nbc,ncd->nad", project, tensor, project)
     return (tensor + tensor.mT) / 2
 
@@ -75,7 +80,12 @@ def mean_curvature(
         True
     """
     tensor = shape_tensor(cloud, neighbors, method=method)
-    return jnp.trace(tensor, axis1=1, axis2=2) / (cloud.dim - 1)
+    return _mean(tensor)
+
+
+@jax.jit
+def _mean(tensor):
+    return jnp.trace(tensor, axis1=1, axis2=2) / (tensor.shape[1] - 1)
 
 
 def gauss_curvature(
@@ -100,6 +110,11 @@ def gauss_curvature(
         ValueError: as `surface_gradient`; a curve.
     """
     a = _in_tangent_plane(cloud, neighbors, method)[0]
+    return _determinant(a)
+
+
+@jax.jit
+def _determinant(a):
     return a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] ** 2
 
 
@@ -127,7 +142,11 @@ def principal_curvatures(
     Raises:
         ValueError: as `surface_gradient`; a curve.
     """
-    a, tangents = _in_tangent_plane(cloud, neighbors, method)
+    return _principal(*_in_tangent_plane(cloud, neighbors, method))
+
+
+@jax.jit
+def _principal(a, tangents):
     mean, half = (a[:, 0, 0] + a[:, 1, 1]) / 2, (a[:, 0, 0] - a[:, 1, 1]) / 2
     square = half**2 + a[:, 0, 1] ** 2
     umbilic = square == 0
@@ -161,13 +180,24 @@ def mean_curvature_vector(
     Raises:
         ValueError: as `laplace_beltrami`.
     """
-    return laplace_beltrami(cloud, neighbors, method=method)(cloud.points - cloud.points.mean(0))
+    instance(cloud, PointCloud, "cloud")
+    return laplace_beltrami(cloud, neighbors, method=method)(_centred(cloud.points))
+
+
+@jax.jit
+def _centred(points):
+    return points - points.mean(0)
 
 
 def _in_tangent_plane(cloud, neighbors, method):
     """The shape tensor as a symmetric 2 x 2 matrix, and the tangents that it refers to."""
+    instance(cloud, PointCloud, "cloud")
     if cloud.dim != 3:
         raise ValueError(f"a surface in 3 dimensions is needed, the cloud has {cloud.dim}")
-    tangents = frames_of(cloud.normals)[:, :2]
-    tensor = shape_tensor(cloud, neighbors, method=method)
+    return _along_tangents(shape_tensor(cloud, neighbors, method=method), cloud.normals)
+
+
+@jax.jit
+def _along_tangents(tensor, normals):
+    tangents = frames_of(normals)[:, :2]
     return jnp.einsum("nap,npq,nbq->nab", tangents, tensor, tangents), tangents

@@ -4,6 +4,7 @@ import importlib
 import pkgutil
 from collections import Counter
 
+import jaxtyping
 import pytest
 
 import jaxsurf as js
@@ -20,6 +21,14 @@ CASES = [
     for module in pkgutil.iter_modules(malformed.__path__, "tests.malformed.")
     for case in importlib.import_module(module.name).CASES
 ]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _own_words():
+    """Annotations are not checked here, as they are not for users: the words must be ours."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.id)

@@ -81,7 +81,7 @@ class PointCloud(eqx.Module):
         points, normals = np.asarray(self.points), np.asarray(self.normals)
         info = np.finfo(points.dtype)
         raise_at(on & ~np.isfinite(points).all(axis=1), "point {i} is not finite: {v}", points)
-        size, largest = np.abs(points).max(axis=1), float(info.max) ** 0.25
+        size, largest = np.abs(points).max(axis=1), 0.1 * float(info.max) ** 0.5
         raise_at(
             on & (size > largest),
             f"point {{i}} has a coordinate of size {{v:.3g}}, at most {largest:.1g} can be "
@@ -90,7 +90,7 @@ class PointCloud(eqx.Module):
         )
         seen = points[on]
         extent = float(np.ptp(seen, axis=0).max(initial=0))
-        least = float(info.tiny) ** 0.25
+        least = 1e4 * float(info.tiny) ** 0.5  # the spacing is a small part of the extent
         if 0 < extent < least:
             raise ValueError(
                 f"points lie within {extent:.3g} of each other, at least {least:.1g} can be "

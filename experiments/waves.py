@@ -90,6 +90,8 @@ def _drop(out: Path) -> list[Row]:
     seconds = time.perf_counter() - clock
     bent = np.asarray(laplacian(jnp.asarray(values.T))).T
     energy = 0.5 * np.mean(velocities**2 - values * bent, axis=1)
+    above = np.flatnonzero(energy > energy[0])
+    grown = float(times[above[0]]) if above.size else float(times[-1])
     passed = (times > 0) & (times <= 1)
     fields = {f"u, t = {times[i]:.2g}": values[i] for i in (3, 8, 18)}
     js.plot_fields(cloud, fields, path=out / "waves.png", cmap="coolwarm", view=_VIEW,
@@ -103,6 +105,7 @@ def _drop(out: Path) -> list[Row]:
             "energy balance", 1.0),
         Row("energy over the first", float(energy[-1] / energy[0]), setting | {"t": 2.0}, 1.0,
             "energy balance"),
+        Row("time at which the energy exceeds the first, 2 if never", grown, setting),
         Row("steps", float(steps), setting),
         Row("seconds to integrate, compilation included", seconds, setting),
     ]  # fmt: skip

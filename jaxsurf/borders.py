@@ -41,6 +41,12 @@ class Border(eqx.Module):
         points: the border points, `(m,)`, piece by piece in order.
         rows: border points around each, in order with the surface on the left, `(2, m, r)`.
         mask: which of them count, `(2, m, r)`.
+
+    Example:
+        >>> square = js.graph(lambda x, y: 0 * x, (6, 6))
+        >>> border = js.find_border(square)
+        >>> len(border.points), int(border.corners.sum())
+        (20, 4)
     """
 
     points: Int[Array, " m"]
@@ -217,6 +223,11 @@ def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
         TypeError: no cloud, no mesh.
         ValueError: traced arrays; no point marked; a marked point without a neighbour along the
             border (named by index); a mesh with another number of vertices, or without border.
+
+    Example:
+        >>> border = js.find_border(js.graph(lambda x, y: 0 * x, (6, 6)))
+        >>> len(border.points), int(border.corners.sum())
+        (20, 4)
     """
     instance(cloud, PointCloud, "cloud")
     if not is_concrete(cloud.points, cloud.normals, cloud.boundary):

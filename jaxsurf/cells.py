@@ -26,6 +26,13 @@ class SearchCapacity(NamedTuple):
     Args:
         k: slots per row.
         candidates: points in the 3^d cells around a point.
+
+    Example:
+        >>> cloud = js.sphere(300)
+        >>> capacity = js.allocate(cloud.points, 0.5)
+        >>> neighbors, report = js.search_neighbors(cloud.points, radius=0.5, capacity=capacity)
+        >>> neighbors.k == capacity.k, bool(report.overflow)
+        (True, False)
     """
 
     k: int

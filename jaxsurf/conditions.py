@@ -38,6 +38,11 @@ class Condition(eqx.Module):
             time that JAX cannot trace.
         ValueError: shapes that do not fit, numbers that are not finite and conormals that are not
             of length one (with the point), a point named twice, no point.
+
+    Example:
+        >>> condition = js.robin(np.array([3, 5]), a=1.0, b=2.0, value=0.5)
+        >>> condition.m, float(condition.at(0.0))
+        (2, 0.5)
     """
 
     where: Int[np.ndarray, " m"]

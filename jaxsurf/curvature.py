@@ -40,6 +40,13 @@ def shape_tensor(
     Differentiable: forward and reverse, in points and normals, for fixed neighbours.
     Raises:
         ValueError: as `surface_gradient`.
+
+    Example:
+        >>> cloud = js.sphere(300, radius=2.0)
+        >>> normal = cloud.normals[0]
+        >>> tangent = jnp.eye(3) - jnp.outer(normal, normal)
+        >>> bool(jnp.abs(js.shape_tensor(cloud)[0] - 0.5 * tangent).max() < 0.02)
+        True
     """
     gradient = surface_gradient(cloud, neighbors, method=method)
     return _symmetric(gradient(cloud.normals), cloud.normals)
@@ -108,6 +115,10 @@ def gauss_curvature(
     Differentiable: forward and reverse, in points and normals, for fixed neighbours.
     Raises:
         ValueError: as `surface_gradient`; a curve.
+
+    Example:
+        >>> bool(jnp.abs(js.gauss_curvature(js.sphere(300, radius=2.0)) - 0.25).max() < 0.02)
+        True
     """
     a = _in_tangent_plane(cloud, neighbors, method)[0]
     return _determinant(a)
@@ -141,6 +152,11 @@ def principal_curvatures(
     the mean curvature).
     Raises:
         ValueError: as `surface_gradient`; a curve.
+
+    Example:
+        >>> values, directions = js.principal_curvatures(js.sphere(300, radius=2.0))
+        >>> bool(jnp.abs(values - 0.5).max() < 0.02), directions.shape
+        (True, (300, 2, 3))
     """
     return _principal(*_in_tangent_plane(cloud, neighbors, method))
 
@@ -179,6 +195,11 @@ def mean_curvature_vector(
     Differentiable: forward and reverse, in points and normals, for fixed neighbours.
     Raises:
         ValueError: as `laplace_beltrami`.
+
+    Example:
+        >>> cloud = js.sphere(300)
+        >>> bool(jnp.abs(js.mean_curvature_vector(cloud) + 2 * cloud.normals).max() < 0.1)
+        True
     """
     instance(cloud, PointCloud, "cloud")
     return laplace_beltrami(cloud, neighbors, method=method)(_centred(cloud.points))

@@ -285,6 +285,12 @@ def biharmonic(
     Differentiable: forward and reverse, in points, normals and field.
     Raises:
         ValueError: as `laplace_beltrami`.
+
+    Example:
+        >>> cloud = js.sphere(300)
+        >>> z = cloud.points[:, 2]
+        >>> bool(jnp.abs(js.biharmonic(cloud)(z) - 4 * z).max() < 1)
+        True
     """
     laplacian = laplace_beltrami(cloud, neighbors, method=method, throw=throw)
     return laplacian @ laplacian

@@ -31,6 +31,11 @@ class Spectrum(NamedTuple):
         abscissa: largest real part.
         residual: $\|A x - \lambda x\| / \|x\|$ of the pair with that real part. There is an
             operator at this distance from A in the 2-norm of which λ is an exact eigenvalue.
+
+    Example:
+        >>> spectrum = js.spectral_estimate(js.laplace_beltrami(js.sphere(300)))
+        >>> bool(spectrum.radius > 100), bool(spectrum.abscissa < 1)
+        (True, True)
     """
 
     radius: float

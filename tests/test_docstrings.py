@@ -1,7 +1,8 @@
-"""Every public example runs."""
+"""Every public name has an example, and every example runs."""
 
 import doctest
 import importlib
+import inspect
 import pkgutil
 
 import jax
@@ -14,6 +15,17 @@ import jaxsurf as js
 MODULES = sorted(
     m.name for m in pkgutil.walk_packages(js.__path__, "jaxsurf.") if "__main__" not in m.name
 )
+
+
+def test_every_public_name_has_an_example():
+    public = {
+        name: value
+        for name, value in vars(js).items()
+        if not name.startswith("_") and not inspect.ismodule(value)
+    }
+    assert len(public) > 80
+    without = [name for name, value in public.items() if ">>> " not in (value.__doc__ or "")]
+    assert not without
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -21,7 +21,7 @@ from . import cases, heat, prompt
 # Measured on a 2-core machine of the same kind, one process each: build s and apply ms at 1e5.
 PEERS = {
     "GFDM(degree=2)": ("Compadre GMLS, degree 2, k = 13", "2.5-4.5", "19"),
-    "GFDM(degree=4)": ("Compadre GMLS, degree 4, k = 37", "15-22", "34"),
+    "GFDM(degree=4)": ("Compadre GMLS, degree 4, k = 37", "15-22; 8.7 on two threads", "34"),
     "DCPSE(order=2)": ("OpenFPM Surface DC-PSE, order 2, k = 26", "14", "22"),
     "DCPSE(order=4)": ("OpenFPM Surface DC-PSE, order 4, k = 47", "107-125", "41"),
 }
@@ -117,6 +117,19 @@ def table(results: list[dict], quick: bool) -> str:
               f"| build | {plain['ours s']:.3f} | {plain['plain JAX s']:.3f} |",
               f"| gradient | {plain['gradient ours s']:.3f} "
               f"| {plain['gradient plain JAX s']:.3f} |"]  # fmt: skip
+    beside = [r for r in results if r["case"] == "build_beside_compadre"]
+    if beside:
+        lines += ["", "| beside Compadre, in one run | k | ours s | Compadre s | / ours "
+                  "| applying / ours | error | its error |",
+                  "|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    for r in beside:
+        v, degree = r["result"], r["arguments"][0]
+        lines.append(
+            f"| degree {degree} | {cases.METHODS[f'GFDM(degree={degree})'][1]} "
+            f"| {v['ours s']:.2f} | {v['Compadre s']:.1f} "
+            f"| {v['Compadre / ours']:.0f} | {v['applying, Compadre / ours']:.0f} "
+            f"| {v['error']:.1e} | {v['Compadre error']:.1e} |"
+        )
     lines += ["", "| DCPSE(order=2), n | build s | peak GiB |", "|---|---|---|"]
     for r in results:
         if r["case"] == "build" and r["arguments"][0] == "DCPSE(order=2)":
@@ -131,6 +144,8 @@ def main() -> None:
         "group", nargs="?", default="stencils", choices=["stencils", "heat", "prompt"]
     )
     parser.add_argument("--quick", action="store_true", help="smaller sizes")
+    parser.add_argument("--compadre", action="store_true",
+                        help="GFDM beside pycompadre, in the same run (extra: peers)")  # fmt: skip
     parser.add_argument("--only", metavar="NAME", help="cases of one function or method")
     parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR")
     parser.add_argument("--readme", action="store_true", help="put the table into the README")
@@ -144,7 +159,12 @@ def main() -> None:
         print(json.dumps(case(*json.loads(arguments))))
         return
     start, results = time.perf_counter(), []
-    plans = {"stencils": plan, "heat": heat.plan, "prompt": prompt.plan}
+    beside = [("build_beside_compadre", [p, 20_000 if options.quick else 100_000]) for p in (2, 4)]
+    plans = {
+        "stencils": lambda quick: plan(quick) + (beside if options.compadre else []),
+        "heat": heat.plan,
+        "prompt": prompt.plan,
+    }
     todo = [
         (name, arguments)
         for name, arguments in plans[options.group](options.quick)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -12,6 +13,7 @@ import scipy.sparse
 
 import jaxsurf as js
 
+from ..report import relative_l2
 from .baselines import numpy_gfdm, plain_jax_gfdm
 from .timing import first_and_median, peak_gib, side_by_side
 
@@ -94,6 +96,53 @@ def build_beside_numpy(degree: int, k: int, n: int) -> dict:
             ours, lambda block=block: numpy_gfdm(points, normals, index, degree, block), 7
         )
         found |= {"ours s": seconds, f"{name} s": theirs, f"{name} / ours": 1 / ratio}
+    return found
+
+
+def build_beside_compadre(degree: int, n: int) -> dict:
+    """GFDM beside Compadre's moving least squares on manifolds, in turn, in one process.
+
+    Compadre is given its usual window of 1.6 times the distance to as many points as it has
+    unknowns; it fits its own frames and searches its own neighbours, neither of which is timed. It
+    uses as many threads as OMP_NUM_THREADS says.
+    """
+    import pycompadre
+
+    name = f"GFDM(degree={degree})"
+    method, k = METHODS[name]
+    cloud, neighbors = _sphere(n, k)
+    points = np.array(cloud.points)  # Compadre wants to be able to write
+    a = np.array([1.0, 2.0, 1.5])
+    s = points @ a
+    u, exact = np.exp(s), np.exp(s) * (a @ a - s**2 - 2 * s)
+    kokkos = pycompadre.KokkosParser()
+    target = pycompadre.TargetOperation.LaplacianOfScalarPointEvaluation
+    gmls = pycompadre.GMLS(degree, 3, "QR", "MANIFOLD", "NO_CONSTRAINT", degree)
+    gmls.setWeightingParameter(3)
+    gmls.setWeightingType("power")
+    helper = pycompadre.ParticleHelper(gmls)
+    helper.generateKDTree(points)
+    gmls.addTargets(target)
+    helper.generateNeighborListsFromKNNSearchAndSet(points, degree, 2, 1.6)
+    build, theirs, ratio = side_by_side(
+        lambda: _laplacian(cloud, neighbors, method).weights,
+        lambda: gmls.generateAlphas(1, False),
+        3,
+    )
+    operator = _laplacian(cloud, neighbors, method)
+    call, values = jax.jit(lambda operator, u: operator(u)), jnp.asarray(u)
+    apply, their_apply, apply_ratio = side_by_side(
+        lambda: call(operator, values), lambda: helper.applyStencil(u[:, None], target), 5
+    )
+    found = {
+        "ours s": build, "Compadre s": theirs, "Compadre / ours": 1 / ratio,
+        "ours ms": 1e3 * apply, "Compadre ms": 1e3 * their_apply,
+        "applying, Compadre / ours": 1 / apply_ratio,
+        "threads": os.environ.get("OMP_NUM_THREADS", "all"),
+        "error": relative_l2(operator(values), exact),
+        "Compadre error": relative_l2(np.ravel(helper.applyStencil(u[:, None], target)), exact),
+    }  # fmt: skip
+    del gmls, helper, kokkos  # in this order, as Compadre asks for
     return found
 
 

@@ -33,7 +33,7 @@ class ClosestPoint:
         """Closest points, the triangles they are on, and their barycentric coordinates.
 
         With `exact=False` only the four triangles with the nearest centres are looked at: a
-        point of the mesh, six times faster, and for points near the mesh hardly another one.
+        point of the mesh, and for points near the mesh hardly another one.
         """
         q = len(points)
         place, triangle, bary = np.empty((q, 3)), np.zeros(q, np.int64), np.empty((q, 3))

@@ -31,6 +31,11 @@ class Eigenmodes(eqx.Module):
         residuals: $\|A f_i + \sum_j f_j b_{ji}\| / \|f_i\|$ with j in the group of i, `(k,)`, in
             units of the values.
         groups: number of the group of equal values that each mode belongs to, `(k,)`.
+
+    Example:
+        >>> modes = js.eigenmodes(js.laplace_beltrami(js.sphere(300)), 4)
+        >>> modes.values.shape, modes.functions.shape
+        ((4,), (300, 4))
     """
 
     values: Float[Array, " k"]

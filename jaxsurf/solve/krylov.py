@@ -23,6 +23,13 @@ class BiCGStab(lx.AbstractLinearSolver):
         rtol: tolerance relative to the norm of the right-hand side.
         atol: absolute tolerance.
         max_steps: most steps, of two products with the operator each.
+
+    Example:
+        >>> import lineax as lx
+        >>> operator = lx.MatrixLinearOperator(jnp.array([[2.0, 1.0], [0.0, 3.0]]))
+        >>> solution = lx.linear_solve(operator, jnp.array([4.0, 6.0]), js.BiCGStab(rtol=1e-6))
+        >>> bool(jnp.abs(solution.value - jnp.array([1.0, 2.0])).max() < 1e-5)
+        True
     """
 
     rtol: float = 1e-8

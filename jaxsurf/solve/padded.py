@@ -17,7 +17,7 @@ from ..stencils.stencil import AbstractOperator, Composition, Stencil
 
 # An entry added by a scatter costs about as much as this many padded slots.
 _SCATTER = 12
-# Below this many entries one gather of everything is faster than a loop over slots.
+# Below this many entries everything is gathered at once, without a loop over slots.
 _SMALL = 50_000
 
 

@@ -31,6 +31,11 @@ class AbstractPreconditioner(eqx.Module):
     Args:
         incoming: layout of the operator's transpose, for adjoint solves; None if unknown.
         mean_zero: the operator annihilates the constants; None if unknown.
+
+    Example:
+        >>> laplacian = js.laplace_beltrami(js.sphere(300))
+        >>> isinstance(js.multigrid(laplacian), js.AbstractPreconditioner)
+        True
     """
 
     incoming: Layout
@@ -50,6 +55,12 @@ class Jacobi(AbstractPreconditioner):
 
     Args:
         diagonal: of the operator, `(n,)`.
+
+    Example:
+        >>> laplacian = js.laplace_beltrami(js.sphere(300))
+        >>> r = jnp.ones(300)
+        >>> bool(jnp.all(js.jacobi(laplacian)(r) == r / laplacian.diagonal))
+        True
     """
 
     diagonal: Float[Array, " n"]
@@ -99,6 +110,11 @@ class Multigrid(AbstractPreconditioner):
     Args:
         levels: from fine to coarse.
         coarsest: inverse of the coarsest operator.
+
+    Example:
+        >>> cycle = js.multigrid(js.laplace_beltrami(js.sphere(300)))
+        >>> cycle(jnp.ones(300)).shape
+        (300,)
     """
 
     levels: tuple[Level, ...]

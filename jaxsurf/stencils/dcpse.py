@@ -39,6 +39,13 @@ class DCPSE(AbstractMethod):
 
     Raises:
         ValueError: an order below 1, a width, number of layers or length that is not positive.
+
+    Example:
+        >>> cloud = js.sphere(300)
+        >>> z = cloud.points[:, 2]
+        >>> operator = js.laplace_beltrami(cloud, method=js.DCPSE(order=4))
+        >>> bool(jnp.abs(operator(z) + 2 * z).max() < 5e-3)
+        True
     """
 
     order: int = eqx.field(static=True, default=2)
@@ -99,6 +106,13 @@ class FlatDCPSE(AbstractMethod):
 
     Raises:
         ValueError: an order below 1, a width or support that is not positive.
+
+    Example:
+        >>> x = np.random.default_rng(0).uniform(size=(200, 2))
+        >>> cloud = js.PointCloud(x)
+        >>> slope = js.partial_derivative(cloud, (1, 0), method=js.FlatDCPSE(order=2))
+        >>> bool(jnp.abs(slope(cloud.points[:, 0] ** 2) - 2 * cloud.points[:, 0]).max() < 1e-9)
+        True
     """
 
     order: int = eqx.field(static=True, default=2)

@@ -49,6 +49,11 @@ class Diagnostics(eqx.Module):
         tube: support radius times the largest normal curvature seen within it. Above 1 the
             tube of that radius around the surface intersects itself: copies along the normals
             cross, and the surface is no graph over the tangent plane.
+
+    Example:
+        >>> found = js.laplace_beltrami(js.sphere(300)).diagnostics
+        >>> int(found.count.min()), bool(found.residual.max() < 1e-8)
+        (36, True)
     """
 
     condition: Float[Array, "*n"]
@@ -79,7 +84,12 @@ class Diagnostics(eqx.Module):
 
 
 class AbstractMethod(eqx.Module):
-    """A way to compute the weights of stencils."""
+    """A way to compute the weights of stencils.
+
+    Example:
+        >>> isinstance(js.GFDM(degree=2), js.AbstractMethod)
+        True
+    """
 
     @abc.abstractmethod
     def neighbor_count(self, dim: int) -> int:

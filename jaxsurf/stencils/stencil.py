@@ -24,7 +24,14 @@ from .method import Diagnostics
 
 
 class AbstractOperator(eqx.Module):
-    """A linear map from fields `(n, *batch, *in_shape)` to fields `(n, *batch, *out_shape)`."""
+    """A linear map from fields `(n, *batch, *in_shape)` to fields `(n, *batch, *out_shape)`.
+
+    Example:
+        >>> laplacian = js.laplace_beltrami(js.sphere(300))
+        >>> twice = laplacian @ laplacian
+        >>> [isinstance(operator, js.AbstractOperator) for operator in (laplacian, twice)]
+        [True, True]
+    """
 
     @property
     @abc.abstractmethod
@@ -276,7 +283,15 @@ _DAMAGE = (
 
 
 class Composition(AbstractOperator):
-    """One operator after another: `(outer @ inner)(u) = outer(inner(u))`."""
+    """One operator after another: `(outer @ inner)(u) = outer(inner(u))`.
+
+    Example:
+        >>> cloud = js.sphere(300)
+        >>> laplacian = js.laplace_beltrami(cloud)
+        >>> z = cloud.points[:, 2]
+        >>> bool(jnp.all((laplacian @ laplacian)(z) == laplacian(laplacian(z))))
+        True
+    """
 
     outer: AbstractOperator
     inner: AbstractOperator

@@ -38,6 +38,15 @@ class Checkpoint(eqx.Module):
 
     Raises:
         ValueError: a time that is not positive.
+
+    Example:
+        >>> cloud = js.sphere(300)
+        >>> problem = js.AdvectionDiffusionReaction(js.laplace_beltrami(cloud))
+        >>> parts = js.Checkpoint("run.npz", every=0.05)
+        >>> run = lambda: js.integrate(problem, cloud.points[:, 2], t1=0.1, checkpoint=parts).ys
+        >>> first, again = run(), run()
+        >>> bool(jnp.all(first == again))  # the second call reads the end of the first
+        True
     """
 
     path: str | Path = eqx.field(static=True)

@@ -193,6 +193,14 @@ class SDIRK(dfx.AbstractAdaptiveSolver):
     is ever made.
     Raises:
         ValueError: another order.
+
+    Example:
+        >>> cloud = js.sphere(300)
+        >>> problem = js.AdvectionDiffusionReaction(js.laplace_beltrami(cloud))
+        >>> u0 = cloud.points[:, 2]
+        >>> u = js.integrate(problem, u0, t1=0.1, solver=js.SDIRK(order=3), dt0=0.05).ys[-1]
+        >>> bool(jnp.abs(u - jnp.exp(-0.2) * u0).max() < 0.01)
+        True
     """
 
     scheme: int = eqx.field(static=True)

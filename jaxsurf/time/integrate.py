@@ -29,6 +29,17 @@ class IntegrationError(RuntimeError):
         solution: what there is: the last entry of `state` is the last good state.
         time: when that was.
         state: the last state that was accepted, conditions filled in.
+
+    Example:
+        >>> cloud = js.sphere(300)
+        >>> problem = js.AdvectionDiffusionReaction(
+        ...     js.laplace_beltrami(cloud), reaction=lambda t, u, args: 50 * u**2
+        ... )
+        >>> try:
+        ...     js.integrate(problem, jnp.ones(300), t1=1.0)
+        ... except js.IntegrationError as error:
+        ...     print(error.time < 0.03)
+        True
     """
 
     def __init__(self, message: str, solution: dfx.Solution, time: float, state: PyTree[Array]):

@@ -28,6 +28,23 @@ class AbstractEvolution(eqx.Module):
 
     A problem of one's own defines `linear` and `rest` and, unless its state is a single field,
     how to fill in conditions (`closed`).
+
+    Example:
+        >>> class Decay(js.AbstractEvolution):
+        ...     laplacian: js.AbstractOperator
+        ...     conditions: None = None
+        ...
+        ...     def linear(self, t, u):
+        ...         return self.laplacian(u)
+        ...
+        ...     def rest(self, t, u, args):
+        ...         return -args * u
+        >>> cloud = js.sphere(300)
+        >>> u0 = cloud.points[:, 2]
+        >>> problem = Decay(js.laplace_beltrami(cloud))
+        >>> u = js.integrate(problem, u0, t1=0.1, args=3.0).ys[-1]
+        >>> bool(jnp.abs(u - jnp.exp(-0.5) * u0).max() < 0.01)
+        True
     """
 
     conditions: eqx.AbstractVar[Closure | None]
@@ -179,6 +196,14 @@ class BiharmonicDiffusion(AbstractEvolution):
     Differentiable: in every array, forward and reverse.
     Raises:
         ValueError: `mass` with boundary conditions.
+
+    Example:
+        >>> cloud = js.sphere(300)
+        >>> u0 = cloud.points[:, 2]
+        >>> problem = js.BiharmonicDiffusion(js.laplace_beltrami(cloud), stiffness=0.1)
+        >>> rate = problem.rate(0.0, u0, None)  # of u = z, with eigenvalue -2
+        >>> bool(jnp.abs(rate + 0.4 * u0).max() < 0.1)
+        True
     """
 
     laplacian: AbstractOperator
@@ -220,6 +245,12 @@ class CahnHilliard(AbstractEvolution):
     Differentiable: in every array, forward and reverse.
     Raises:
         ValueError: `mass` with boundary conditions.
+
+    Example:
+        >>> laplacian = js.laplace_beltrami(js.sphere(300))
+        >>> problem = js.CahnHilliard(laplacian, width=0.2)
+        >>> bool(jnp.abs(problem.rate(0.0, jnp.ones(300), None)).max() < 1e-9)  # a phase stays
+        True
     """
 
     laplacian: AbstractOperator

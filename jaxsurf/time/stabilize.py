@@ -41,6 +41,13 @@ def hyperviscosity(
 
     Raises:
         ValueError: a power below one, a strength that is not positive.
+
+    Example:
+        >>> laplacian = js.laplace_beltrami(js.sphere(300))
+        >>> damping = js.hyperviscosity(laplacian, 1.0)
+        >>> rough = jnp.asarray(np.random.default_rng(0).normal(size=300))
+        >>> bool(jnp.vdot(rough, damping(rough)) < 0)
+        True
     """
     if power < 1:
         raise ValueError(f"power = {power}, at least 1 is needed")
@@ -84,6 +91,13 @@ def upwinding(
     Differentiable: as `diffusion`, where the velocity does not vanish.
     Raises:
         ValueError: as `diffusion`; a velocity of the wrong shape.
+
+    Example:
+        >>> cloud = js.sphere(300)
+        >>> x, y, z = cloud.points.T
+        >>> damping = js.upwinding(cloud, jnp.stack([-y, x, 0 * z], axis=1))
+        >>> bool(jnp.vdot(x, damping(x)) < 0)
+        True
     """
     velocity = jnp.asarray(velocity)
     if velocity.shape != cloud.points.shape:

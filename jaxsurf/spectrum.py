@@ -34,7 +34,7 @@ class Spectrum(NamedTuple):
 
     Example:
         >>> spectrum = js.spectral_estimate(js.laplace_beltrami(js.sphere(300)))
-        >>> bool(spectrum.radius > 100), bool(spectrum.abscissa < 1)
+        >>> bool(spectrum.radius > 10), bool(spectrum.abscissa < 1)
         (True, True)
     """
 

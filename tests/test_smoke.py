@@ -29,7 +29,7 @@ def test_one_call_of_each_kind(tmp_path):
     distance = js.geodesic_distance(cloud, jnp.array([top]))
     assert abs(float(distance[jnp.argmin(z)]) - np.pi) < 0.3
 
-    js.write(tmp_path / "cloud.ply", cloud)
-    assert js.read(tmp_path / "cloud.ply").n == N
+    js.write(tmp_path / "cloud.xyz", cloud)
+    assert js.read(tmp_path / "cloud.xyz").n == N
     laplacian.save(tmp_path / "laplacian.npz")
     assert jnp.all(js.Stencil.load(tmp_path / "laplacian.npz")(z) == laplacian(z))

@@ -31,8 +31,8 @@ class AbstractEvolution(eqx.Module):
 
     Example:
         >>> class Decay(js.AbstractEvolution):
+        ...     conditions: None
         ...     laplacian: js.AbstractOperator
-        ...     conditions: None = None
         ...
         ...     def linear(self, t, u):
         ...         return self.laplacian(u)
@@ -41,7 +41,7 @@ class AbstractEvolution(eqx.Module):
         ...         return -args * u
         >>> cloud = js.sphere(300)
         >>> u0 = cloud.points[:, 2]
-        >>> problem = Decay(js.laplace_beltrami(cloud))
+        >>> problem = Decay(None, js.laplace_beltrami(cloud))
         >>> u = js.integrate(problem, u0, t1=0.1, args=3.0).ys[-1]
         >>> bool(jnp.abs(u - jnp.exp(-0.5) * u0).max() < 0.01)
         True

@@ -36,6 +36,13 @@ class PointCloud(eqx.Module):
         ValueError: wrong shapes, fewer than one point; on concrete arrays also points that are not
             finite, and so large or so close that squared distances leave the range of their type,
             normals that are not of length one, all named by index.
+
+    Example:
+        >>> angle = 2 * np.pi * np.arange(50) / 50
+        >>> points = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        >>> cloud = js.PointCloud(points, points)
+        >>> cloud.n, cloud.dim
+        (50, 2)
     """
 
     points: Float[Array, "n d"]

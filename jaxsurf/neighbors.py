@@ -55,6 +55,11 @@ class Neighbors(eqx.Module):
         TypeError: indices that are not integers, a mask that is not bool.
         ValueError: shapes that do not fit; on concrete arrays also an index that is no point, a
             slot 0 that is not the point itself, a mask that leaves nothing.
+
+    Example:
+        >>> neighbors = js.find_neighbors(js.sphere(300), k=12)
+        >>> neighbors.indices.shape, bool(neighbors.mask.all())
+        ((300, 12), True)
     """
 
     indices: Int[Array, "n k"]

@@ -121,6 +121,11 @@ class Stencil(AbstractOperator):
     Raises:
         TypeError: indices that are not integers, weights that are not real floating-point numbers.
         ValueError: shapes that do not fit; on concrete arrays an index that is no point.
+
+    Example:
+        >>> laplacian = js.laplace_beltrami(js.sphere(300))
+        >>> laplacian(jnp.ones((300, 2))).shape, laplacian.to_scipy().shape
+        ((300, 2), (300, 300))
     """
 
     indices: Int[Array, "k n"]

@@ -34,7 +34,7 @@ def polynomial_degree(method: Method) -> int:
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    n = 20_000 if quick else 100_000
+    n = 5_000 if quick else 100_000
     surface = surfaces.sphere()
     kinds = ("regular", "jittered")
     jobs = [(kind, "exact", method, k) for kind in kinds for method, k in TIMED.values()]

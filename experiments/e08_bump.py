@@ -262,7 +262,7 @@ def run(quick: bool, out: Path) -> list[Row]:
             setting = {"height": alpha, "probe": probe, "unknowns": int(reference.unknowns)}
             quantity = f"change of the reference's peak, spacing {fine[0]} to {fine[1]}"
             rows.append(Row(quantity, change, setting))
-        for way in _WAYS[2:] if quick else _WAYS:
+        for way in _WAYS[2:3] if quick else _WAYS:
             made = way.make(alpha)
             ours = diffuse(made, rtol=way.tolerance, atol=way.tolerance)
             setting = {"height": alpha, "n": made.n, "way": made.name, "tolerance": way.tolerance}

@@ -11,7 +11,7 @@ from xml.sax.saxutils import escape
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Shaped
 
 from jaxsurf.arguments import in_range, instance, is_concrete, raise_at, real, whole
 from jaxsurf.cloud import PointCloud
@@ -235,7 +235,7 @@ def read_fields(path: str | Path, *, columns: str | None = None) -> dict[str, np
 def write(
     path: str | Path,
     cloud: PointCloud,
-    fields: Mapping[str, Float[Array, "n ..."]] | None = None,
+    fields: Mapping[str, Shaped[Array | np.ndarray, "n ..."]] | None = None,
 ) -> None:
     """File with the points, normals and fields, for ParaView and for `read`.
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Real
 from scipy.spatial import cKDTree
 
 from jaxsurf.arguments import instance, on_host, raise_at, real, whole
@@ -100,7 +100,7 @@ def _draw(ax, scene: _Scene, values, *, label=None, title=None, cmap=None, limit
 
 def plot_fields(
     cloud: PointCloud,
-    fields: Mapping[str, Float[Array, " n"] | None],
+    fields: Mapping[str, Real[Array | np.ndarray, " n"] | None],
     *,
     path: str | Path | None = None,
     columns: int = 3,

@@ -67,7 +67,8 @@ class Border(eqx.Module):
             if given.dtype.kind not in "iu":
                 raise TypeError(f"{name} is of type {given.dtype}, expected indices")
             if is_concrete(given):
-                raise_at(np.ravel(given) < 0, f"{name} names point {{v}}", np.ravel(given))
+                values = np.asarray(given).ravel()
+                raise_at(values < 0, f"{name} names point {{v}}", values)
 
     def __repr__(self):
         _, m, r = self.rows.shape
@@ -192,15 +193,14 @@ def border_conormals(cloud: PointCloud, border: Border | None = None) -> Float[A
     """
     instance(cloud, PointCloud, "cloud")
     border = find_border(cloud) if border is None else checked_border(border, cloud)
-    order = np.argsort(border.points) if is_concrete(border.points) else jnp.argsort(border.points)
-    return border.conormals(cloud)[order]
+    return border.conormals(cloud)[jnp.argsort(border.points)]
 
 
 def checked_border(border: Border, cloud: PointCloud) -> Border:
     """Refuse what is no border, or that of a larger cloud."""
     instance(border, Border, "border", "made by js.find_border")
     if is_concrete(border.points):
-        last = int(np.max(border.points))
+        last = int(np.asarray(border.points).max())
         if last >= cloud.n:
             raise ValueError(f"border names point {last}, the cloud has {cloud.n}")
     return border

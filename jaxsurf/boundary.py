@@ -104,8 +104,9 @@ class Closure(eqx.Module):
         for name in ("rows", "indices"):
             found = getattr(self, name)
             if is_concrete(found):
-                bad = np.ravel((np.asarray(found) < 0) | (np.asarray(found) >= self.n))
-                raise_at(bad, f"{name} names point {{v}}, there are {self.n}", np.ravel(found))
+                values = np.asarray(found).ravel()
+                bad = (values < 0) | (values >= self.n)
+                raise_at(bad, f"{name} names point {{v}}, there are {self.n}", values)
 
     def __repr__(self):
         said = ", ".join(repr(source.condition) for source in self.sources) or "no condition"

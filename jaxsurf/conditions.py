@@ -145,7 +145,8 @@ def _told(x) -> str:
     """A number, or the range of several."""
     if not is_concrete(x):
         return f"traced{list(x.shape)}"
-    low, high = float(np.min(x)), float(np.max(x))
+    x = np.asarray(x)
+    low, high = float(x.min()), float(x.max())
     return f"{low:.4g}" if low == high else f"{low:.4g}..{high:.4g}"
 
 
@@ -200,8 +201,8 @@ def robin(
     where: Where,
     value: Value = 0.0,
     *,
-    a: float | Float[Array, " m"],
-    b: float | Float[Array, " m"],
+    a: float | Float[Array, "*a"],
+    b: float | Float[Array, "*b"],
     conormals: Float[Array, "m d"] | None = None,
 ) -> Condition:
     r"""The condition $a\,u + b\,\partial_\nu u = g$; passive for a, b > 0.

@@ -22,9 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .build import choose_neighbors
+from .boundary import Closure, close
 from .cloud import PointCloud
-from .curvature import gauss_curvature, mean_curvature
+from .conditions import dirichlet
+from .curvature import shape_tensor
 from .formats import contents_of
 from .frames import tangent_frames
 from .io import read, write
@@ -35,8 +36,11 @@ from .shapes.implicit import double_torus, level_set, level_set_normals, project
 from .spectrum import Spectrum, spectral_estimate
 from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil
+from .time.explicit import RKC2
+from .time.integrate import integrate
+from .time.pde import AdvectionDiffusionReaction
 
-STAGES = ("points", "neighbours", "operator", "spectrum", "curvature", "heat", "gradient", "files")
+STAGES = ("points", "operator", "spectrum", "curvature", "heat", "files")
 
 
 class Surface(NamedTuple):
@@ -147,35 +151,42 @@ def central_point(surface: Surface) -> int:
 
 
 class Heat(NamedTuple):
-    """How long, in how many steps of Heun's method, and when to look."""
+    """How long, in how many steps, when to look, and a bound of the operator's eigenvalues."""
 
     until: float
     steps: int
     frames: tuple[float, ...]
+    radius: float
 
     @staticmethod
     def within(until: float, radius: float) -> Heat:
-        """As few steps as are stable with a margin: Heun's method needs dt rho < 2."""
-        return Heat(until, max(int(np.ceil(until * radius / 1.6)), 10), (0.0, until / 5, until))
+        """Steps short enough for a hot spot; what else stability asks for, RKC2's stages give."""
+        return Heat(until, _STEPS, (0.0, until / 5, until), _MARGIN * radius)
 
 
-@eqx.filter_jit
-def diffuse(laplacian: Stencil, start: Float[Array, " n"], heat: Heat) -> Float[Array, "frames n"]:
-    r"""Temperatures $u_t = \Delta_S u$ at the frames. Differentiable in the operator and start."""
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, u, operator: operator(u)),
-        diffrax.Heun(),
-        0.0,
-        heat.until,
-        heat.until / heat.steps,
+# The spectral radius is estimated from below.
+_STEPS, _MARGIN = 40, 1.2
+
+
+def diffuse(
+    laplacian: Stencil, conditions: Closure | None, start: Float[Array, " n"], heat: Heat
+) -> Float[Array, "frames n"]:
+    r"""Temperatures $u_t = \Delta_S u$ at the frames; borders keep theirs.
+
+    Differentiable in the operator and the start.
+    """
+    if conditions is not None:
+        held = start[conditions.rows]
+        conditions = eqx.tree_at(lambda c: c.sources[0].condition.value, conditions, held)
+    return integrate(
+        AdvectionDiffusionReaction(laplacian, conditions=conditions),
         start,
-        args=laplacian,
-        saveat=diffrax.SaveAt(ts=heat.frames),
-        # One more than counted: the sum of the steps may end just below the final time.
-        max_steps=heat.steps + 1,
-        adjoint=diffrax.RecursiveCheckpointAdjoint(),
-    )
-    return solution.ys
+        t1=heat.until,
+        solver=RKC2(spectral_radius=heat.radius),
+        # Given steps make the end a smooth function of the surface.
+        dt0=heat.until / heat.steps,
+        saveat=diffrax.SaveAt(ts=jnp.asarray(heat.frames, start.dtype)),
+    ).ys  # type: ignore[return-value]
 
 
 # --- the whole -----------------------------------------------------------------------------
@@ -264,30 +275,29 @@ def run(
     with stage("points"):
         surface = sample()
         cloud = surface.cloud
-    with stage("neighbours"):
-        neighbors = choose_neighbors(cloud, method=method)
     with stage("operator"):
-        laplacian = laplace_beltrami(cloud, neighbors, method=method)
-        jax.block_until_ready(laplacian.weights)
+        laplacian = laplace_beltrami(cloud, method=method)
+        neighbors = _lists(laplacian)
+        conditions = _held_at_border(cloud)
     with stage("spectrum"):
-        spectrum = spectral_estimate(_held_at_border(laplacian, cloud))
+        spectrum = spectral_estimate(_at_rest_on_border(laplacian))
     with stage("curvature"):
-        curvature = _curvature(cloud, neighbors, method)
+        curvature = jax.block_until_ready(_curvature(cloud, neighbors, method))
     with stage("heat"):
         areas = cell_areas(cloud, neighbors)
         source = central_point(surface)
         start = _spot(cloud, source, surface.size / 16)
-        heat = Heat.within(until or _rounded(surface.size**2 / 100), spectrum.radius)
-        temperature = diffuse(_held_at_border(laplacian, cloud), start, heat)
-        temperature.block_until_ready()
+        heat = Heat.within(until or _rounded(surface.size**2 / 100), float(spectrum.radius))
         probe = _probe(cloud, source, float(np.sqrt(2 * heat.until)))
-    with stage("gradient"):
+        # One program for heat, gradient and difference: another takes longer to compile than it
+        # saves.
         value = jnp.asarray(surface.parameter[1], start.dtype)
-        rest = (surface.moved, neighbors, method, heat, probe)
-        gradient, sensitivity = _gradient(value, start, *rest)
+        at = lambda value: _with_gradient(
+            value, start, surface.moved, neighbors, method, conditions, heat, jnp.asarray(probe)
+        )
+        (_, temperature), (gradient, sensitivity) = at(value)
         step = 1e-4 * value
-        above = _temperature_at(value + step, start, *rest)
-        below = _temperature_at(value - step, start, *rest)
+        above, below = (at(value + h)[0][0] for h in (step, -step))
         difference = (above - below) / (2 * step)
     demo = Demo(
         surface,
@@ -344,33 +354,43 @@ def save(demo: Demo, out: Path) -> list[Path]:
     return files
 
 
-def _temperature_at(value, start, moved, neighbors, method, heat: Heat, probe: int):
-    """Final temperature at the probe on the surface for a value of its parameter."""
-    cloud = moved(value)
-    laplacian = laplace_beltrami(cloud, neighbors, method=method)
-    return diffuse(_held_at_border(laplacian, cloud), start, heat)[-1, probe]
+def _temperature_at(value, start, moved, neighbors, method, conditions, heat, probe):
+    """Final temperature at the probe for a value of the surface's parameter; and all others."""
+    laplacian = laplace_beltrami(moved(value), neighbors, method=method)
+    temperature = diffuse(laplacian, conditions, start, heat)
+    return temperature[-1, probe], temperature
 
 
 # Everything large is an argument: arrays that a compiled function closes over are folded.
-_gradient = eqx.filter_jit(jax.grad(_temperature_at, argnums=(0, 1)))
+_with_gradient = eqx.filter_jit(jax.value_and_grad(_temperature_at, argnums=(0, 1), has_aux=True))
 
 
-def _held_at_border(laplacian: Stencil, cloud: PointCloud) -> Stencil:
+def _lists(operator: Stencil) -> Neighbors:
+    """The neighbours that an operator was built on: a padded slot repeats its own point."""
+    slots = operator.indices.T
+    return Neighbors(slots, (slots != slots[:, :1]).at[:, 0].set(True))
+
+
+def _held_at_border(cloud: PointCloud) -> Closure | None:
     """Border points keep their temperature: without it the problem is not well posed."""
-    return laplacian if cloud.boundary is None else laplacian.scaled(1.0 - cloud.boundary)
+    border = cloud.boundary
+    if border is None or not border.any():
+        return None
+    return close(cloud, dirichlet(border, jnp.zeros(int(border.sum()), cloud.points.dtype)))
+
+
+def _at_rest_on_border(laplacian: Stencil) -> Stencil:
+    border = laplacian.border
+    return laplacian if border is None else laplacian.scaled(1.0 - border)
 
 
 def _curvature(cloud, neighbors, method) -> dict[str, Float[Array, " n"]]:
+    """All from one shape tensor, as its stencils are the dearest part."""
+    tensor = shape_tensor(cloud, neighbors, method=method)
+    trace = jnp.trace(tensor, axis1=1, axis2=2)
     if cloud.dim == 2:
-        return {"curve": mean_curvature(cloud, neighbors, method=method)}
-    mean, gauss = jax.block_until_ready(_mean_and_gauss(cloud, neighbors, method))
-    return {"mean": mean, "Gauss": gauss}
-
-
-@eqx.filter_jit
-def _mean_and_gauss(cloud, neighbors, method):
-    """Both at once: the compiler sees that they share the shape tensor."""
-    return tuple(f(cloud, neighbors, method=method) for f in (mean_curvature, gauss_curvature))
+        return {"curve": trace}
+    return {"mean": trace / 2, "Gauss": (trace**2 - jnp.sum(tensor**2, axis=(1, 2))) / 2}
 
 
 def _spot(cloud: PointCloud, source: int, width: float) -> Float[Array, " n"]:

@@ -11,7 +11,7 @@ import scipy.sparse.linalg
 import jaxsurf as js
 from jaxsurf.boundary import check_border
 
-from .helpers import check_derivative
+from .helpers import central_difference, check_derivative, count_compilations
 
 # Minutes in all.
 pytestmark = pytest.mark.slow
@@ -397,27 +397,185 @@ U = jnp.asarray(np.random.default_rng(2).normal(size=SMALL.n))
 FLUX = jnp.asarray(np.random.default_rng(3).normal(size=BORDER.points.shape))
 
 
-def closed_value(points=SMALL.points, value=FLUX, a=0.5, b=1.0, u=U):
-    cloud = js.PointCloud(points, SMALL.normals)
-    here = np.asarray(SMALL.boundary)
-    conditions = js.robin(here, value, a=a, b=b)
-    return PROBE @ js.close(cloud, conditions, neighbors=NEAR, border=BORDER)(u)
+def bent(cloud) -> js.PointCloud:
+    """The same points on z = 0.3 x y + 0.2 x²: on a plane nothing depends on the normals."""
+    x, y = cloud.points[:, 0], cloud.points[:, 1]
+    normals = jnp.stack([-0.3 * y - 0.4 * x, -0.3 * x, jnp.ones_like(x)], axis=1)
+    normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+    points = cloud.points.at[:, 2].set(0.3 * x * y + 0.2 * x**2)
+    return js.PointCloud(points, normals, boundary=cloud.boundary)
 
 
-@pytest.mark.parametrize("what", ["points", "value", "a", "b", "u"])
-def test_derivatives_of_the_closure(what):
-    start = dict(points=SMALL.points, value=FLUX, a=0.5 + 0 * FLUX, b=1 + 0 * FLUX, u=U)[what]
-    check_derivative(lambda x: closed_value(**{what: x}), start)
+BENT = bent(SMALL)
+START = dict(
+    points=BENT.points,
+    normals=BENT.normals,
+    value=FLUX,
+    a=0.5 + 0 * FLUX,
+    b=1 + 0 * FLUX,
+    conormals=js.border_conormals(BENT, BORDER),
+    u=U,
+)
 
 
-def test_derivatives_of_images():
+def closed_field(points, normals, value, a, b, conormals, u):
+    """A field closed by Robin conditions: with conormals given, and with those of the border."""
+    cloud = js.PointCloud(points, normals, boundary=SMALL.boundary)
+    where = np.asarray(SMALL.boundary)
+    given = js.robin(where, value, a=a, b=b, conormals=conormals)
+    found = js.robin(where, value, a=a, b=b)
+    closures = [js.close(cloud, c, neighbors=NEAR, border=BORDER) for c in (given, found)]
+    return jnp.stack([closure(u) for closure in closures])
+
+
+def test_derivatives_of_the_closure():
+    # In everything at once, and then in each argument: forward mode, reverse mode, differences.
+    unit = lambda v: v / jnp.linalg.norm(v, axis=-1, keepdims=True)
+    rng = np.random.default_rng(4)
+    slopes = {name: jnp.asarray(rng.normal(size=x.shape)) for name, x in START.items()}
+
+    @jax.jit
+    def f(arguments):
+        # Normals and conormals stay unit vectors.
+        arguments = {k: unit(v) if "normals" in k else v for k, v in arguments.items()}
+        return jnp.sum(jnp.array([1.0, 2.0])[:, None] * PROBE * closed_field(**arguments))
+
+    gradient = jax.jit(jax.grad(f))(START)
+    forward = jax.jit(lambda slopes: jax.jvp(f, (START,), (slopes,))[1])
+    for name in START:
+        one = {k: v * (k == name) for k, v in slopes.items()}
+        expected = central_difference(
+            lambda h, one=one: f({k: v + h * one[k] for k, v in START.items()}), 0.0, 1.0, 1e-4
+        )
+        reverse = float(jnp.vdot(gradient[name], slopes[name]))
+        assert abs(expected) > 1e-2, name  # there is something to differentiate
+        np.testing.assert_allclose(reverse, float(forward(one)), rtol=1e-9, err_msg=name)
+        np.testing.assert_allclose(reverse, expected, rtol=1e-6, err_msg=name)
+
+
+def test_derivatives_of_conormals():
+    @jax.jit
+    def f(x):
+        points, normals = x
+        normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+        nu = js.border_conormals(js.PointCloud(points, normals), BORDER)
+        return jnp.sum(jnp.sin(jnp.arange(nu.size)) * nu.ravel())
+
+    check_derivative(f, jnp.stack([SMALL.points, SMALL.normals]), step=1e-4)
+
+
+def test_closures_and_conormals_under_vmap():
+    shifts = jnp.array([0.0, 0.1, 0.2])
+
+    def filled(s):
+        moved = SMALL.points.at[:, 2].add(s * SMALL.points[:, 0] ** 2)
+        normals = jnp.stack([-2 * s * SMALL.points[:, 0], 0 * U, 1 + 0 * U], axis=1)
+        normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+        cloud = js.PointCloud(moved, normals)
+        condition = js.robin(np.asarray(SMALL.boundary), s + FLUX, a=1.0 + s, b=1.0)
+        closure = js.close(cloud, condition, neighbors=NEAR, border=BORDER)
+        return closure(U * (1 + s)), js.border_conormals(cloud, BORDER)
+
+    together = jax.vmap(filled)(shifts)
+    one = jax.jit(filled)
+    for i, s in enumerate(shifts):
+        for many, single in zip(together, one(s)):
+            np.testing.assert_allclose(many[i], single, atol=1e-12)
+
+
+def test_ghosts_under_transformations():
     def f(x):
         a, b, g = x
         _, closure = js.with_ghosts(SMALL, js.robin(SMALL.boundary, g, a=a, b=b), border=BORDER)
         filled = closure.extend(U)
         return jnp.sum(jnp.sin(jnp.arange(len(filled))) * filled)
 
-    check_derivative(f, jnp.stack([0.5 + 0 * FLUX, 1 + 0 * FLUX, FLUX]))
+    start = jnp.stack([0.5 + 0 * FLUX, 1 + 0 * FLUX, FLUX])
+    check_derivative(f, start)
+    many = jax.vmap(f)(jnp.stack([start, 2 * start]))
+    np.testing.assert_allclose(many, [f(start), f(2 * start)], rtol=1e-12)
+
+
+def test_single_precision():
+    # Bounds set before: some hundred units of round-off, as the stencils amplify it by 1/h.
+    single = js.PointCloud(
+        SMALL.points.astype(jnp.float32),
+        SMALL.normals.astype(jnp.float32),
+        boundary=SMALL.boundary,
+    )
+    border = js.find_border(single)
+    np.testing.assert_array_equal(js.detect_border(single), js.detect_border(SMALL))
+    nu = js.border_conormals(single)
+    assert nu.dtype == jnp.float32
+    np.testing.assert_allclose(nu, js.border_conormals(SMALL), atol=1e-5)
+    where = np.asarray(SMALL.boundary)
+    conditions = js.robin(where, FLUX, a=0.5, b=1.0)
+    closure = js.close(single, conditions)
+    filled = closure(U.astype(jnp.float32))
+    assert filled.dtype == closure.weights.dtype == closure.offset().dtype == jnp.float32
+    np.testing.assert_allclose(filled, js.close(SMALL, conditions)(U), atol=2e-5)
+    wide, images = js.with_ghosts(single, conditions)
+    exact_cloud, exact = js.with_ghosts(SMALL, conditions)
+    assert wide.points.dtype == images.weights.dtype == jnp.float32
+    assert wide.n == exact_cloud.n
+    np.testing.assert_allclose(wide.points, exact_cloud.points, atol=3e-5)
+    filled = images.extend(U.astype(jnp.float32))
+    np.testing.assert_allclose(filled, exact.extend(U), rtol=1e-4, atol=2e-4)
+    assert len(border.points) == where.sum()
+
+
+def test_new_numbers_compile_nothing():
+    """Values, coefficients, functions of time and points of the same sizes."""
+
+    def once(scale, value, a):
+        points = scale * SMALL.points
+        cloud = js.PointCloud(points, SMALL.normals, boundary=SMALL.boundary)
+        where = np.asarray(SMALL.boundary)
+        border = js.find_border(cloud)
+        js.detect_border(cloud)
+        js.border_conormals(cloud, border)
+        filled = []
+        for g in (value, lambda t: value * jnp.cos(t)):
+            closure = js.close(cloud, js.robin(where, g, a=a, b=1.0), border=border)
+            filled.append(closure(U, 0.3))
+        _, closure = js.with_ghosts(cloud, js.robin(where, value, a=a, b=1.0), border=border)
+        return [*filled, closure.extend(U)]
+
+    once(1.0, 1.0, 0.5)
+    once(1.5, 1.5, 0.7)
+    with count_compilations() as compiled:
+        once(2.0, 3.0, 0.9)
+    assert not compiled
+
+
+def test_borders_do_not_hang_on_the_last_bit():
+    cloud = square(9, jitter=0.0)
+    where, other = np.asarray(cloud.boundary), np.random.default_rng(5)
+    first = js.find_border(cloud)
+    wide, closure = js.with_ghosts(cloud, js.neumann(where))
+    for _ in range(3):
+        points = np.asarray(cloud.points) * (1 + 1e-15 * other.normal(size=cloud.points.shape))
+        points = points + 1e-15 * other.normal(size=points.shape)
+        near = js.PointCloud(points, cloud.normals, boundary=where)
+        again = js.find_border(near)
+        for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
+            np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(js.detect_border(near), js.detect_border(cloud))
+        wide_again, closure_again = js.with_ghosts(near, js.neumann(where))
+        np.testing.assert_allclose(wide_again.points, wide.points, atol=1e-12)
+        np.testing.assert_array_equal(closure_again.indices, closure.indices)
+
+
+def test_what_borders_and_closures_say_of_themselves():
+    where = np.asarray(SMALL.boundary)
+    closure = js.close(SMALL, [js.dirichlet([40], 2.0), js.free(where)])
+    assert repr(closure) == (
+        "Closure(1 of 81 points bound: dirichlet(1 points, value=2), free(32 points))"
+    )
+    assert repr(js.robin([3, 4], jnp.array([1.0, 2.5]), a=1.0, b=0.5)) == (
+        "robin(2 points, value=1..2.5, a=1, b=0.5)"
+    )
+    assert repr(BORDER) == "Border(32 points, 4 corners, rows of up to 5 points)"
 
 
 # --- borders -------------------------------------------------------------------------------

@@ -23,6 +23,13 @@ def run(capsys, *arguments) -> tuple[int, str, str]:
     return code, out, err
 
 
+def stages_told(err: str) -> list[str]:
+    """What is said of the progress where there is no terminal: a line for each stage, in order."""
+    told = [re.fullmatch(r" *[\d.]+ s  (\d)/6 (\w+)", row) for row in err.splitlines()]
+    assert [int(found[1]) for found in told] == list(range(1, len(told) + 1))
+    return [found[2] for found in told]
+
+
 def line(report: str, label: str) -> str:
     return next(row for row in report.splitlines() if row.startswith(label))
 
@@ -46,9 +53,11 @@ def check_files(folder: Path, n: int) -> None:
 
 
 def test_demo(tmp_path, capsys):
+    # Few points: nearly all of the time is compilation.
     code, report, err = run(capsys, "--points", 3_000, "--out", tmp_path)
-    assert code == 0 and err == ""
+    assert code == 0 and stages_told(err) == list(demo.STAGES)
     assert "points           3,000" in report
+    assert "GFDM(degree=4)" in line(report, "method")
     assert number(report, "heat conserved", "to") < 5e-3
     assert number(report, "  difference", "relative difference") < 1e-6
     # The largest modulus of the fourth-order Laplacian is 4.6 / h² on even points.
@@ -69,7 +78,7 @@ def test_demo_on_a_scan(tmp_path, capsys):
     path = _DATA / "stanford-bunny.obj"
     arguments = ("--surface", path, "--points", 2_000, "--method", "dcpse2", "--out", tmp_path)
     code, report, err = run(capsys, *arguments)
-    assert code == 0 and err == ""
+    assert code == 0 and stages_told(err) == list(demo.STAGES)
     assert "1113 vertices belong to no triangle" in report
     assert "on borders" in line(report, "points")
     assert number(report, "  difference", "relative difference") < 1e-6
@@ -134,8 +143,9 @@ def test_bad_input_is_one_line(arguments, words, tmp_path, monkeypatch, capsys):
     Path("notes.txt").write_text("hello\n")
     code, out, err = run(capsys, *arguments)
     assert code == 2 and out == ""
-    assert words in err and err.count("\n") == 1
-    assert err.startswith("jaxsurf demo: error: ")
+    *progress, error = err.splitlines()
+    assert words in error and error.startswith("jaxsurf demo: error: ")
+    assert stages_told("\n".join(progress)) == list(demo.STAGES)[: len(progress)]
 
 
 @pytest.mark.parametrize(

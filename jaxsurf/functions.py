@@ -2,8 +2,8 @@ r"""Functions as the programs that they run, told apart by what they compute.
 
 To `jax.jit` every new lambda is another function, and each makes it compile again, even where the
 code is the same; and what a function closes over is a constant of the program. Here a function is
-traced to its program: the arrays it closes over become arguments, and two programs are equal when
-they do the same to their arguments.
+traced to its program: the arrays it closes over and the real numbers in it become arguments, and
+two programs are equal when they do the same to their arguments.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var
 from jaxtyping import Array, PyTree
 
 
@@ -30,14 +30,14 @@ class Traced(eqx.Module):
         program: what is done to them and the arguments.
     """
 
-    constants: list[Array]
+    constants: list[Any]
     program: Program = eqx.field(static=True)
 
     def __call__(self, *args):
         return self.program.run(self.constants, args)
 
 
-def canonical(f: Callable, *examples: PyTree[Array]) -> Traced:
+def canonical(f: Callable, *examples: Any) -> Traced:
     """The function as a program, for arguments of the shapes and types of the examples.
 
     Arrays that f closes over (traced ones too) or that are leaves of it (an `eqx.Module` or one of
@@ -59,14 +59,14 @@ def canonical(f: Callable, *examples: PyTree[Array]) -> Traced:
         return out
 
     closed = jax.make_jaxpr(run)(*flat)
+    jaxpr, numbers = _without_numbers(closed.jaxpr)
     own = len(jax.tree.leaves(leaves[0]))
-    kept = _read(closed.jaxpr)
-    inputs = [*closed.jaxpr.constvars, *closed.jaxpr.invars]
-    count = len(closed.consts) + own
-    constants = [*closed.consts, *flat[:own]]
-    used = [i for i in range(count) if inputs[i] in kept]
-    order = tuple(used), tuple(range(count, len(inputs)))
-    program = Program(closed.jaxpr, order, _structure(leaves[1], rest[1]), results[0])
+    kept = _read(jaxpr)
+    inputs = [*jaxpr.constvars, *jaxpr.invars]
+    constants = [*closed.consts, *numbers, *flat[:own]]
+    used = [i for i in range(len(constants)) if inputs[i] in kept]
+    order = tuple(used), tuple(range(len(constants), len(inputs)))
+    program = Program(jaxpr, order, _structure(leaves[1], rest[1]), results[0])
     return Traced([jnp.asarray(constants[i]) for i in used], program)
 
 
@@ -121,6 +121,23 @@ class Program:
         """Tells programs apart, in another process too."""
         text = re.sub(r"0x[0-9a-f]+", "", repr(self._key))
         return f"Program({hashlib.sha256(text.encode()).hexdigest()})"
+
+
+def _without_numbers(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:
+    """The program with the real numbers in its operations as further constants."""
+    numbers: list[Array] = []
+    names = []
+
+    def replaced(v):
+        dtype = getattr(v.aval, "dtype", None)
+        if not (isinstance(v, Literal) and dtype and jnp.issubdtype(dtype, jnp.floating)):
+            return v
+        numbers.append(jnp.asarray(v.val, dtype))
+        names.append(Var(v.aval))
+        return names[-1]
+
+    equations = [e.replace(invars=[replaced(v) for v in e.invars]) for e in jaxpr.eqns]
+    return jaxpr.replace(eqns=equations, constvars=[*jaxpr.constvars, *names]), numbers
 
 
 def _structure(leaves: PyTree, rest: PyTree) -> tuple:

@@ -95,3 +95,14 @@ def random_sphere(n, seed=0) -> js.PointCloud:
     points = np.random.default_rng(seed).normal(size=(n, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     return js.PointCloud(points, points)
+
+
+def ring(n=24):
+    """Angles, Laplacian and gradient by central differences on a circle, exact eigenvalues."""
+    angles = np.arange(n) * 2 * np.pi / n
+    h, own = angles[1], np.arange(n)
+    near = jnp.asarray(np.stack([own, (own - 1) % n, (own + 1) % n]), jnp.int32)
+    laplacian = js.Stencil(near, jnp.tile(jnp.array([[-2.0], [1.0], [1.0]]) / h**2, (1, n)))
+    tangents = np.stack([-np.sin(angles), np.cos(angles)])
+    slopes = np.array([0.0, -1.0, 1.0])[:, None, None] / (2 * h) * tangents
+    return jnp.asarray(angles), laplacian, js.Stencil(near, jnp.asarray(slopes), (2,))

@@ -31,7 +31,9 @@ def test_equal_code_is_one_program_whatever_arrays_it_closes_over():
 def test_other_code_numbers_and_hidden_constants_make_other_programs():
     """Also where the text of the program is the same: constants of inner programs are not in it."""
     first = canonical(scaled(2.0), 0.5, U)
-    for f in (scaled(np.nextafter(2.0, 3)), scaled(2.0, 3), lambda t, u: u):
+    near = canonical(scaled(np.nextafter(2.0, 3)), 0.5, U)
+    assert near.program == first.program and near.constants != first.constants
+    for f in (scaled(2.0, 3), lambda t, u: u):
         assert canonical(f, 0.5, U).program != first.program
     weights = [jnp.array([1.0, 2.0, w]) for w in (3.0, 4.0)]
     one, other = (

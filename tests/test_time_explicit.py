@@ -10,9 +10,6 @@ import pytest
 import jaxsurf as js
 from jaxsurf.time.chebyshev import table
 
-# Minutes in all.
-pytestmark = pytest.mark.slow
-
 CLOUD = js.sphere(300)
 NEIGHBORS = js.choose_neighbors(CLOUD)
 LAPLACIAN = js.laplace_beltrami(CLOUD, NEIGHBORS)
@@ -31,7 +28,6 @@ def stability_polynomial(s, z):
     return last
 
 
-@pytest.mark.core
 @pytest.mark.parametrize("s", [2, 3, 5, 20, 100])
 def test_stability_polynomial(s):
     z = np.array([-1e-2, -1e-3])
@@ -48,7 +44,6 @@ def heat(dt, solver, u0, t1=0.5, **settings):
     return dfx.diffeqsolve(term, solver, 0.0, t1, dt, u0, **settings)
 
 
-@pytest.mark.core
 def test_second_order_for_a_nonlinear_problem_in_time():
     """u' = cos(t) u² of which the solution is known; all stages and their nodes count."""
     term = dfx.ODETerm(lambda t, u, args: jnp.cos(t) * u**2)
@@ -139,7 +134,6 @@ def test_nothing_is_traced_again_when_the_number_of_stages_changes():
     assert traces == before
 
 
-@pytest.mark.core
 @pytest.mark.parametrize("reach", [3.0, 900.0], ids=["3 stages", "38 stages: several intervals"])
 def test_derivatives(reach):
     """In the state, the operator, and a parameter that the right-hand side closes over."""

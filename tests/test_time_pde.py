@@ -3,16 +3,14 @@
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import pytest
 import scipy.linalg
 
 import jaxsurf as js
 
-from .helpers import jittered_sphere, relative_error
-
-# Minutes in all.
-pytestmark = pytest.mark.slow
+from .helpers import jittered_sphere, relative_error, ring
 
 CLOUD = js.sphere(600)
 METHOD = js.DCPSE(order=4)
@@ -23,7 +21,6 @@ X, Y, Z = CLOUD.points.T
 TURN = jnp.cross(jnp.array([0.0, 0.0, 1.0]), CLOUD.points)  # one radian per unit of time
 
 
-@pytest.mark.core
 def test_two_species_with_their_own_diffusivities_and_a_reaction():
     """z decays with 2 D, xy with 6 D; the reaction turns the two species into each other."""
     u0 = jnp.stack([Z + X * Y, 0 * Z], axis=1)
@@ -69,7 +66,6 @@ def test_rotation_carries_the_field_along(conservative):
         np.testing.assert_allclose(pair.ys[-1], jnp.stack([u, 2 * u], axis=1), rtol=1e-4)
 
 
-@pytest.mark.core
 def test_compressible_flow():
     """v = grad z: the two forms differ by u times the divergence, -2 z."""
     v = jnp.array([0.0, 0.0, 1.0]) - Z[:, None] * CLOUD.points
@@ -121,7 +117,6 @@ def test_hyperviscosity_is_of_high_order():
     assert np.log2(errors[0] / errors[1]) > 2.7  # h halves, h³
 
 
-@pytest.mark.core
 @pytest.mark.parametrize("damping", [0.0, 0.5])
 def test_standing_wave(damping):
     """u = e^(-γt/2) cos(ω t) z, ω² = 2 c² - γ²/4, the forcing constant."""
@@ -139,7 +134,6 @@ def test_standing_wave(damping):
         np.testing.assert_allclose(lifted - solution.ys[0][-1], 2.0, atol=1e-5)
 
 
-@pytest.mark.core
 def test_biharmonic_decay():
     problem = js.BiharmonicDiffusion(LAPLACIAN, stiffness=0.1)
     u = js.integrate(problem, X * Y, t1=0.2, rtol=1e-6, atol=1e-8).ys[-1]
@@ -229,7 +223,6 @@ def test_rates_are_differentiable_in_every_array():
     np.testing.assert_allclose(float(sum(products)), expected, rtol=1e-8)
 
 
-@pytest.mark.core
 @pytest.mark.parametrize(
     "arguments, message",
     [
@@ -257,3 +250,151 @@ def test_misuse_seen_in_the_rate():
         js.hyperviscosity(LAPLACIAN, 1.0, strength=-1)
     with pytest.raises(ValueError, match="velocity has shape"):
         js.upwinding(CLOUD, TURN[:3])
+
+
+# --- derivatives of whole integrations, conditions, problems of one's own -------------------
+
+ANGLES, RING, _ = ring(16)
+WAVY = jnp.exp(jnp.cos(ANGLES))
+
+
+def wave_of(inputs):
+    u0, weights, speed, damping = inputs
+    problem = js.WaveEquation(js.Stencil(RING.indices, weights), speed=speed, damping=damping)
+    return problem, (u0, jnp.sin(ANGLES)), dict(solver=dfx.Tsit5())
+
+
+def phases_of(inputs):
+    u0, weights, width, mobility = inputs
+    operator = js.Stencil(RING.indices, weights)
+    return js.CahnHilliard(operator, width=width, mobility=mobility), u0, dict(solver=js.IMEX())
+
+
+@pytest.mark.parametrize(
+    "made, numbers",
+    [(wave_of, (1.3, 0.4)), (phases_of, (0.5, 0.2))],
+    ids=["waves: speed and damping", "phases: width and mobility"],
+)
+def test_derivatives_of_waves_and_phases(made, numbers):
+    """In the state, the operator and both parameters, each against differences of its own."""
+    inputs = (WAVY - 1, RING.weights, *map(jnp.asarray, numbers))
+
+    def scalar(inputs, adjoint=None):
+        problem, u0, how = made(inputs)
+        ys = js.integrate(problem, u0, t1=0.1, dt0=0.02, adjoint=adjoint, **how).ys
+        return sum(jnp.sum(y[-1] ** 2 * (1 + jnp.cos(ANGLES))) for y in jax.tree.leaves(ys))
+
+    value, gradient = jax.jit(scalar), jax.jit(jax.grad(scalar))(inputs)
+    tangent = jax.jit(lambda d: jax.jvp(lambda x: scalar(x, dfx.ForwardMode()), (inputs,), (d,))[1])
+    for k in range(4):
+        direction = jax.tree.map(jnp.zeros_like, inputs)
+        move = jnp.asarray(np.random.default_rng(k).normal(size=jnp.shape(inputs[k])))
+        direction = (*direction[:k], move * inputs[k], *direction[k + 1 :])
+        moved = lambda h, d=direction: jax.tree.map(lambda x, d: x + h * d, inputs, d)
+        slope = lambda h, at=moved: float(value(at(h)) - value(at(-h))) / (2 * h)
+        expected = (4 * slope(1e-4) - slope(2e-4)) / 3
+        reverse = float(jnp.vdot(gradient[k], direction[k]))
+        np.testing.assert_allclose(reverse, expected, rtol=1e-6)
+        np.testing.assert_allclose(float(tangent(direction)), reverse, rtol=1e-8)
+
+
+def square(n):
+    return js.graph(lambda x, y: 0.0 * x, (n, n))
+
+
+@pytest.mark.parametrize("ghosts", [False, True], ids=["closed", "ghosts"])
+@pytest.mark.parametrize("kind", ["neumann", "robin"])
+def test_heat_under_flux_conditions(kind, ghosts):
+    """cos(a x) e^(-a² t) on a square, with ∂u = 0 or u + b ∂u = 0, b = cot(a) / a, at x = ±1."""
+    cloud, method = square(13), js.GFDM(degree=2)
+    x = cloud.points[:, 0]
+    side = np.abs(np.abs(np.asarray(x)) - 1) < 1e-9
+    a = np.pi if kind == "neumann" else 1.0
+    flux = (
+        js.neumann(side) if kind == "neumann" else js.robin(side, 0.0, a=1.0, b=1 / np.tan(a) / a)
+    )
+    rest = js.neumann(np.asarray(cloud.boundary) & ~side)
+    if ghosts:
+        wide, closure = js.with_ghosts(cloud, [flux, rest], method=method)
+    else:
+        wide, closure = cloud, js.close(cloud, [flux, rest], method=method)
+    problem = js.AdvectionDiffusionReaction(
+        js.laplace_beltrami(wide, method=method), conditions=closure
+    )
+    u0 = closure.extend(jnp.cos(a * x)) if ghosts else jnp.cos(a * x)
+    solution = js.integrate(problem, u0, t1=0.2, rtol=1e-5, atol=1e-7)
+    exact = np.exp(-(a**2) * 0.2) * jnp.cos(a * x)
+    assert float(jnp.abs(solution.ys[-1][: cloud.n] - exact).max()) < 0.02 * np.exp(-(a**2) * 0.2)
+    # Without a word on the border it is refused.
+    if not ghosts:
+        with pytest.raises(ValueError, match=r"js\.free"):
+            js.integrate(js.AdvectionDiffusionReaction(problem.laplacian), u0, t1=0.2)
+
+
+class Swing(js.AbstractEvolution):
+    """A pair of fields that turn into each other, stiffly damped: a problem of one's own."""
+
+    conditions: None
+    laplacian: js.Stencil
+    speed: float
+
+    def linear(self, t, u):
+        return tuple(0.01 * self.laplacian(self.laplacian(-part)) for part in u)
+
+    def rest(self, t, u, args):
+        return -self.speed * u[1], self.speed * u[0]
+
+
+def test_a_problem_and_a_preconditioner_of_ones_own():
+    c = jnp.cos(ANGLES)
+    rate = -2 * (1 - np.cos(float(ANGLES[1]))) / float(ANGLES[1]) ** 2
+    problem = Swing(None, RING, 2.0)
+    assert js.choose_solver(problem)[1].startswith("IMEX")
+    steps = []
+
+    def inverse(g):
+        """The diagonal of 1 + 0.01 g L², approximately."""
+        steps.append(g)
+        top = float(jnp.abs(RING.weights[0]).max()) ** 2 * 1.5
+        scale = lambda u: jax.tree.map(lambda v: v / (1 + 0.01 * g * top), u)
+        return lx.FunctionLinearOperator(scale, jax.eval_shape(lambda: (c, c)))
+
+    exact = np.exp(-0.01 * rate**2) * jnp.stack([np.cos(2.0) * c, np.sin(2.0) * c])
+    for solver in (None, js.IMEX(order=3, preconditioner=inverse)):
+        u = js.integrate(problem, (c, 0 * c), t1=1.0, solver=solver, rtol=1e-6, atol=1e-8).ys
+        np.testing.assert_allclose(jnp.stack([part[-1] for part in u]), exact, atol=1e-4)
+    assert steps
+
+
+def test_upwinding_takes_the_neighbours_given_also_under_jit():
+    cloud = js.PointCloud(CLOUD.points, CLOUD.normals)  # no spacing of its own
+    make = lambda v, near: js.upwinding(cloud, v, neighbors=near).weights
+    near = js.choose_neighbors(cloud)
+    moved = jax.jit(lambda p, v: js.upwinding(js.PointCloud(p, p), v, neighbors=near).weights)
+    np.testing.assert_allclose(moved(cloud.points, TURN), make(TURN, near), rtol=1e-8, atol=1e-8)
+
+
+SINGLE = [js.RKC2(), js.IMEX(order=2), js.IMEX(order=3), js.SDIRK(order=3), dfx.Tsit5()]
+
+
+@pytest.mark.parametrize("solver", SINGLE, ids=lambda s: type(s).__name__)
+def test_single_precision(solver):
+    """Without 64 bits: values to 1e-3, derivatives to 1e-2, at tolerances of the default size."""
+    with jax.enable_x64(False):
+        narrow = lambda x: jnp.asarray(np.asarray(x), jnp.float32)
+        operator = js.Stencil(RING.indices, narrow(RING.weights))
+        u0, rate = narrow(WAVY), -2 * (1 - np.cos(np.pi / 8)) / (np.pi / 8) ** 2
+
+        def end(d, u0):
+            problem = js.AdvectionDiffusionReaction(operator, diffusivity=d)
+            return js.integrate(problem, u0, t1=0.5, solver=solver).ys[-1]
+
+        wave = narrow(jnp.cos(ANGLES))
+        u = end(1.0, wave)
+        assert u.dtype == jnp.float32
+        np.testing.assert_allclose(u, np.exp(rate / 2) * np.asarray(wave), atol=1e-3)
+        slope = jax.grad(lambda d: jnp.vdot(end(d, wave), wave))(1.0)
+        exact = rate / 2 * np.exp(rate / 2) * float(jnp.vdot(wave, wave))
+        np.testing.assert_allclose(float(slope), exact, rtol=1e-2)
+        with pytest.raises(ValueError, match="jax_enable_x64"):
+            js.integrate(js.AdvectionDiffusionReaction(operator), u0, t1=0.5, rtol=1e-8)

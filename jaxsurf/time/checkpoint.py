@@ -14,10 +14,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 from tqdm import tqdm
 
-from ..arguments import is_concrete
+from ..arguments import real
+from .run import Plan, Run
 
 _COUNTS = ("num_accepted_steps", "num_rejected_steps", "num_steps")
 
@@ -28,7 +29,8 @@ class Checkpoint(eqx.Module):
     The run is done in parts of equal length in time, each from nothing but the state at its
     start. So a run that goes on from its file ends, bit by bit, in what the same run without
     interruption ends in. If the file is there, `js.integrate` goes on from it; it must be of the
-    same run (problem, initial state, times and settings, compared by value).
+    same run: problem, initial state, times and settings are compared by value, functions by what
+    they compute.
 
     Args:
         path: of the file, a NumPy archive; replaced in one piece, so that a run that is killed
@@ -37,6 +39,7 @@ class Checkpoint(eqx.Module):
             and ends with a step of its own, so that many short parts cost steps.
 
     Raises:
+        TypeError: a path or a time that is none.
         ValueError: a time that is not positive.
 
     Example:
@@ -52,9 +55,10 @@ class Checkpoint(eqx.Module):
     path: str | Path = eqx.field(static=True)
     every: float = eqx.field(static=True)
 
-    def __check_init__(self):
-        if not self.every > 0:
-            raise ValueError(f"every = {self.every}, a positive time is needed")
+    def __init__(self, path: str | Path, every: float):
+        if not isinstance(path, str | os.PathLike):
+            raise TypeError(f"path is a {type(path).__name__}, expected the path of a file")
+        self.path, self.every = Path(path), float(real(every, "every", above=0))
 
 
 class _Progress(NamedTuple):
@@ -74,33 +78,23 @@ class _Progress(NamedTuple):
 
 
 def integrate_in_parts(
-    checkpoint: Checkpoint,
-    solve: Callable[[PyTree[Array], float, float, dfx.SaveAt], dfx.Solution],
-    u0: PyTree[Array],
-    t0: Any,
-    t1: Any,
-    saveat: dfx.SaveAt,
-    args: Any,
-    settings: PyTree,
-    progress: bool,
+    checkpoint: Checkpoint, plan: Plan, solve: Callable[[Run], dfx.Solution], progress: bool
 ) -> dfx.Solution:
-    """One part after another, each by `solve(state, start, end, saveat)`.
+    """One part after another.
 
     Args:
         checkpoint: where and how often.
-        solve: integrates one part; its last save is the final state.
-        u0, t0, t1: initial state and times.
-        saveat: what to save: at t0, t1 and given times.
-        args: handed to what saves.
-        settings: everything else that the steps depend on.
+        plan: of the whole run.
+        solve: integrates one part.
         progress: show a bar.
     """
-    sub = _single(saveat)
-    if not is_concrete(*jax.tree.leaves((u0, t0, t1, args, settings))):
+    run = plan.run
+    sub = _single(run.saveat)
+    if not plan.concrete:
         raise ValueError("a checkpoint needs concrete arrays: it is written by the host")
-    t0, t1 = float(t0), float(t1)
+    t0, t1 = float(run.t0), float(run.t1)
     if not t1 > t0:
-        raise ValueError(f"a checkpoint needs t1 > t0, not from {t0} to {t1}")
+        raise ValueError(f"a checkpoint needs t1 > t0, not from t0 = {t0} to t1 = {t1}")
     # A remainder that is nothing but round-off is no part of its own.
     count = max(1, int(np.ceil((t1 - t0) / checkpoint.every * (1 - 1e-12))))
     ends = np.append(t0 + checkpoint.every * np.arange(count), t1)
@@ -109,23 +103,23 @@ def integrate_in_parts(
     asked = np.array([sub.t0, *[True] * len(between), sub.t1])
 
     path = Path(checkpoint.path)
-    key = _digest((checkpoint.every, u0, t0, t1, sub.ts, args, settings))
-    one = jax.eval_shape(lambda: sub.fn(t0, u0, args))
+    key = _digest((checkpoint.every, run))
+    one = jax.eval_shape(lambda: sub.fn(run.t0, run.u0, run.args))
     saved = jax.tree.map(lambda y: np.zeros((len(times), *y.shape), y.dtype), one)
-    now = _Progress(np.array(0), jax.tree.map(np.asarray, u0), saved, np.zeros(3, int))
+    now = _Progress(np.array(0), jax.tree.map(np.asarray, run.u0), saved, np.zeros(3, int))
     if path.exists():
         now = _read(path, key, now)
     reached = times <= ends[int(now.part)]
+    last_state = run.saveat.subs[1]
     solution, last = None, float(ends[int(now.part)])
     bar = tqdm(total=count, initial=int(now.part), disable=not progress, unit="part")
     with bar:
         for part in range(int(now.part), count):
             start, end = float(ends[part]), float(ends[part + 1])
-            subs = [
-                dfx.SubSaveAt(ts=jnp.clip(jnp.asarray(times), start, end), fn=sub.fn),
-                dfx.SubSaveAt(t1=True),
-            ]
-            solution = solve(now.state, start, end, dfx.SaveAt(subs=subs))
+            within = jnp.clip(jnp.asarray(times, run.t0.dtype), start, end)
+            subs = [dfx.SubSaveAt(ts=within, fn=sub.fn), last_state]
+            saveat = eqx.tree_at(lambda s: s.subs, run.saveat, (subs, last_state))
+            solution = solve(run.over(now.state, start, end, saveat))
             assert solution.ts is not None and solution.ys is not None
             last = float(solution.ts[1][-1])
             new = (times <= last) & ((times > start) | ((part == 0) & (times == start)))
@@ -139,11 +133,11 @@ def integrate_in_parts(
                 break
             _write(path, key, now)
             bar.update()
-    return _joined(solution, now, times, asked, reached, last, sub, args)
+    return _joined(solution, now, times, asked, reached, last, sub, run.args)
 
 
 def _single(saveat: dfx.SaveAt) -> dfx.SubSaveAt:
-    sub = saveat.subs
+    sub = saveat.subs[0]
     stores = saveat.dense or saveat.solver_state or saveat.controller_state
     if not isinstance(sub, dfx.SubSaveAt) or sub.steps or stores:
         raise ValueError("with a checkpoint, save at t0, t1 and given times only")
@@ -176,35 +170,58 @@ def _joined(
 
 
 def _digest(content: PyTree) -> str:
-    """Of all values and all that is static; functions count by their being there."""
+    """Of all numbers, of all that is static, and of what functions compute."""
     found = hashlib.sha256()
-    leaves, structure = jax.tree.flatten(eqx.filter(content, eqx.is_array_like))
+    leaves, structure = jax.tree.flatten(content)
     for leaf in leaves:
-        found.update(np.ascontiguousarray(leaf).tobytes())
-    # Addresses differ between processes.
-    found.update(re.sub(r" at 0x[0-9a-f]+", "", str(structure)).encode())
+        if eqx.is_array_like(leaf):
+            leaf = np.asarray(leaf)
+            found.update(f"{leaf.dtype}{leaf.shape}".encode() + leaf.tobytes())
+        else:
+            found.update(_described(leaf).encode())
+    found.update(_without_addresses(str(structure)).encode())
     return found.hexdigest()
 
 
+def _described(value: Any) -> str:
+    """Something that is no array, with the code and the surroundings of a function."""
+    code = getattr(value, "__code__", None)
+    if code is None:
+        return _without_addresses(repr(value))
+    cells = [cell.cell_contents for cell in value.__closure__ or ()]
+    inside = _digest((cells, value.__defaults__)) if cells or value.__defaults__ else ""
+    return _without_addresses(f"{value.__qualname__}{code.co_code!r}{code.co_consts}{inside}")
+
+
+def _without_addresses(text: str) -> str:
+    """They differ between processes."""
+    return re.sub(r" at 0x[0-9a-f]+", "", text)
+
+
 def _write(path: Path, key: str, now: _Progress) -> None:
-    data = {f"leaf_{i:04d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(now))}
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(now)]
+    data = {f"leaf_{i:04d}": leaf for i, leaf in enumerate(leaves)}
     partial = path.with_name(path.name + ".part")
     with open(partial, "wb") as file:
-        np.savez(file, allow_pickle=False, key=np.array(key), **data)
+        seal = np.array(_digest((key, leaves)))
+        np.savez(file, allow_pickle=False, key=np.array(key), seal=seal, **data)
         file.flush()
         os.fsync(file.fileno())
     os.replace(partial, path)
 
 
 def _read(path: Path, key: str, like: _Progress) -> _Progress:
-    count, structure = len(jax.tree.leaves(like)), jax.tree.structure(like)
+    expected, structure = jax.tree.flatten(like)
     try:
         with np.load(path, allow_pickle=False) as archive:
-            found = str(archive["key"])
-            leaves = [archive[f"leaf_{i:04d}"] for i in range(count)] if found == key else []
-    except (OSError, EOFError, KeyError, ValueError) as error:
-        raise ValueError(f"{path} does not hold a checkpoint: {error}") from error
-    if found != key:
+            found, seal = str(archive["key"]), str(archive["seal"])
+            leaves = [archive[name] for name in sorted(archive.files) if name.startswith("leaf_")]
+    except Exception as error:  # a damaged archive raises anything
+        raise ValueError(f"{path} does not hold a checkpoint, or is damaged: {error}") from error
+    if seal != _digest((found, leaves)):
+        raise ValueError(f"{path} is damaged: its content does not have the digest {seal}")
+    shapes = [[(np.shape(leaf), np.asarray(leaf).dtype) for leaf in x] for x in (leaves, expected)]
+    if found != key or shapes[0] != shapes[1]:
         raise ValueError(
             f"{path} is a checkpoint of another run: problem, initial state, times or settings "
             "differ. Remove it or choose another path"

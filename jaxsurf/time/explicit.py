@@ -2,7 +2,8 @@ r"""Runge–Kutta–Chebyshev: explicit steps whose stable length grows with the
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple, get_args
 
 import diffrax as dfx
 import equinox as eqx
@@ -11,7 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
+from ..arguments import real, whole
+from ..functions import numbers_as_arrays
 from .chebyshev import Loop, last_stage
+from .states import dtype_of, frozen, length, small
 
 # Steps between two estimates of the spectral radius, applications in the first and in later ones.
 _REFRESH, _FIRST, _LATER = 25, 20, 4
@@ -75,16 +79,25 @@ class RKC2(dfx.AbstractAdaptiveSolver):
         True
     """
 
-    spectral_radius: ArrayLike | None = None
-    max_stages: int = eqx.field(static=True, default=200)
-    loop: Loop = eqx.field(static=True, default="checkpointed")
+    spectral_radius: ArrayLike | None
+    max_stages: int = eqx.field(static=True)
+    loop: Loop = eqx.field(static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar = dfx.ThirdOrderHermitePolynomialInterpolation
 
-    def __check_init__(self):
-        if self.max_stages < 2:
-            raise ValueError(f"max_stages = {self.max_stages}, at least 2 stages are needed")
+    def __init__(
+        self,
+        spectral_radius: ArrayLike | None = None,
+        max_stages: int = 200,
+        loop: Loop = "checkpointed",
+    ):
+        if spectral_radius is not None:
+            spectral_radius = numbers_as_arrays(real(spectral_radius, "spectral_radius", above=0))
+        if loop not in get_args(Loop):
+            raise ValueError(f"loop = {loop!r}, expected one of {', '.join(get_args(Loop))}")
+        self.spectral_radius, self.loop = spectral_radius, loop
+        self.max_stages = whole(max_stages, "max_stages", least=2)
 
     def order(self, terms):
         return 2
@@ -102,16 +115,16 @@ class RKC2(dfx.AbstractAdaptiveSolver):
 
     def init(self, terms, t0, t1, y0, args):
         rate = terms.vf(t0, y0, args)
-        real = jnp.result_type(*jax.tree.leaves(y0), float)
         age = jnp.asarray(0)
         if self.spectral_radius is not None:
-            return _State(rate, jnp.asarray(self.spectral_radius, real), None, age)
+            return _State(rate, jnp.asarray(self.spectral_radius, dtype_of(y0)), None, age)
         start = jax.tree.map(_noise, y0)
         radius, direction = _power(terms, t0, y0, args, rate, start, _FIRST)
         return _State(rate, radius, direction, age)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        state = self._refreshed(terms, t0, y0, args, solver_state)
+        rate = after_jump(made_jump, solver_state.rate, lambda: terms.vf(t0, y0, args))
+        state = self._refreshed(terms, t0, y0, args, solver_state._replace(rate=rate))
         span = terms.contr(t0, t1)
         k0 = terms.prod(state.rate, span)
         need = 1.54 * jax.lax.stop_gradient(jnp.abs(t1 - t0)) * state.radius
@@ -142,32 +155,29 @@ class RKC2(dfx.AbstractAdaptiveSolver):
         return jax.lax.cond(state.age < _REFRESH, lambda: state, again)
 
 
+def after_jump(made_jump, rate: PyTree[Array], fresh: Callable[[], PyTree[Array]]):
+    """The rate at the start of a step: that at the end of the one before, but after a jump."""
+    if made_jump is False:  # known when the program is made
+        return rate
+    return jax.lax.cond(jnp.asarray(made_jump), fresh, lambda: rate)
+
+
 def _power(terms, t, y, args, rate, direction, count: int):
     """Spectral radius of the Jacobian by power iterations on differences, and its direction."""
-    terms, y, args, rate, direction = _frozen((terms, y, args, rate, direction))
-    eps = jnp.finfo(jnp.result_type(*jax.tree.leaves(y))).eps
-    size = jnp.sqrt(eps) * jnp.maximum(_norm(y), 1)
+    terms, y, args, rate, direction = frozen((terms, y, args, rate, direction))
+    size = small(y)
 
     def multiply(carry, _):
         v, _ = carry
-        scale = size / _norm(v)
+        scale = size / length(v)
         moved = terms.vf(t, jax.tree.map(lambda y, v: y + scale * v, y, v), args)
         v = jax.tree.map(lambda a, b: (a - b) / size, moved, rate)
-        length = _norm(v)
-        kept = jax.tree.map(lambda v, d: jnp.where(length > 0, v, d), v, direction)
-        return (kept, length), None
+        stretched = length(v)
+        kept = jax.tree.map(lambda v, d: jnp.where(stretched > 0, v, d), v, direction)
+        return (kept, stretched), None
 
-    (v, length), _ = jax.lax.scan(multiply, (direction, jnp.zeros_like(size)), length=count)
-    return _frozen((_SAFETY * length, v))
-
-
-def _frozen(tree):
-    """The same values, constants to differentiation."""
-    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
-
-
-def _norm(y: PyTree[Array]) -> Float[Array, ""]:
-    return jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(y)))
+    (v, radius), _ = jax.lax.scan(multiply, (direction, jnp.zeros_like(size)), length=count)
+    return frozen((_SAFETY * radius, v))
 
 
 def _noise(y: Array) -> Array:

@@ -2,23 +2,24 @@ r"""One call from a problem and a state to a solution in time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
 from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
+import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from ..arguments import as_float
+from ..arguments import instance, raise_at, real
+from ..functions import numbers_as_arrays
+from .asked import bad_rows
 from .checkpoint import Checkpoint, integrate_in_parts
 from .pde import AbstractEvolution
-from .run import Run
-
-# Steps that are allowed when the number that are stored does not grow with it, and otherwise.
-_MANY_STEPS, _STORED_STEPS = 10_000_000, 4096
+from .run import UNDAMPED, Plan, Run, planned, solve, undamped
+from .stability import Verdict
+from .states import root_mean_square
 
 
 class IntegrationError(RuntimeError):
@@ -87,23 +88,32 @@ def integrate(
         checkpoint: write the state to disk now and then, and go on from there if it is.
         adjoint: how to differentiate; by default reverse mode with 64 copies of the state
             however many the steps. `diffrax.ForwardMode()` for forward mode.
-        args: handed to reactions and forcings.
-        max_steps: by default ten million, or 4,096 where every step is stored; with a
-            checkpoint, of one part.
+        args: handed to reactions and forcings. Numbers in it are arrays to them; what has to be
+            a constant (an index, a shape) is for them to close over.
+        max_steps: by default ten million, or 4,096 where every step is stored, and a `dt0` that
+            makes more is an error; with a checkpoint, of one part.
         throw: raise if the end is not reached; if False, see `Solution.result`.
 
     Returns:
         A `diffrax.Solution`: times `ts`, states `ys` with time first, `stats`, `result`. On
-        concrete arrays `stats["solver"]` says how it was done.
+        concrete arrays `stats["solver"]` says how it was done, `stats["summary"]` what came of it.
+        Other numbers, arrays of the same shapes and functions of the same code compile nothing.
 
-    Accuracy: of each solver, in its docstring; the number of digits follows `rtol`.
+    Accuracy: of each solver, in its docstring; the number of digits follows `rtol`. In single
+        precision 1e-3 in values and 1e-2 in derivatives at the default tolerances, for every
+        solver (`tests/test_time_pde.py::test_single_precision`); `rtol` below 5e-7 is refused.
     Differentiable: reverse (forward with `ForwardMode`) in the state, the problem and `args`, for
     the steps taken: how the controller chose them is not differentiated.
     Raises:
-        ValueError: a state that is not finite, or for which the right-hand side is not; a
+        TypeError: arguments of another kind; functions not made of operations of JAX; a state of
+            another precision than its rate.
+        ValueError: a state that is not finite, or for which the right-hand side is not; explicit
+            steps beyond the limit of stability (with step, limit and spectral radius); diffusion
+            backwards in time; a border about which nothing is said; tolerances out of range; a
             checkpoint that is of another run or damaged.
-        IntegrationError: the end was not reached: the solution diverges, the tolerance cannot
-            be met, a linear system does not converge. Holds the last good state. (Under
+        IntegrationError: the end was not reached: the solution diverges (or grows a hundredfold
+            where the equation lets none grow), the tolerance cannot be met, a linear system does
+            not converge. Holds the last good state. (Under
             `jit` an error of the run time.)
 
     Example:
@@ -115,41 +125,18 @@ def integrate(
         >>> bool(jnp.abs(solution.ys[-1] - jnp.exp(-1.0) * cloud.points[:, 2]).max() < 0.01)
         True
     """
-    saveat = dfx.SaveAt(t1=True) if saveat is None else saveat
     if checkpoint is not None:
-
-        def part(state, start, end, saves):
-            return integrate(
-                problem, state, t1=end, t0=start, solver=solver, dt0=dt0, rtol=rtol, atol=atol,
-                controller=controller, saveat=saves, event=event, adjoint=adjoint, args=args,
-                max_steps=max_steps, throw=throw,
-            )  # fmt: skip
-
-        settings = (problem, solver, dt0, rtol, atol, controller, event)
-        return integrate_in_parts(
-            checkpoint, part, jax.tree.map(as_float, u0), t0, t1, saveat, args, settings,
-            progress,
-        )  # fmt: skip
-    run = Run.of(problem, u0, t0, t1, solver, dt0, rtol, atol, controller, adjoint, args)
-    if max_steps is None:
-        max_steps = _STORED_STEPS if _stores_steps(saveat) else _MANY_STEPS
-    solution = dfx.diffeqsolve(
-        run.terms,
-        run.solver,
-        run.t0,
-        run.t1,
-        run.dt0,
-        run.u0,
-        args,
-        saveat=_with_last(_closed(saveat, run.problem), run.problem),
-        stepsize_controller=run.controller,
-        adjoint=run.adjoint,
-        event=event,
-        max_steps=max_steps,
-        throw=throw and not run.concrete,
-        progress_meter=dfx.TqdmProgressMeter() if progress else dfx.NoProgressMeter(),
-    )
-    return _finished(run, solution, throw)
+        instance(checkpoint, Checkpoint, "checkpoint", "js.Checkpoint(path, every=...)")
+    plan = planned(
+        problem, u0, t0, t1, solver, dt0, rtol, atol, controller, saveat, event, adjoint, args,
+        max_steps, progress and checkpoint is None, throw,
+    )  # fmt: skip
+    if undamped(problem) and plan.concrete:
+        warnings.warn(UNDAMPED, stacklevel=2)
+    if checkpoint is None:
+        return _finished(plan, plan.run, throw)
+    part = lambda run: _finished(plan, run, throw)
+    return integrate_in_parts(checkpoint, plan, part, progress)
 
 
 def steady_state(*, rtol: float = 1e-4, atol: float = 1e-6) -> dfx.Event:
@@ -166,72 +153,85 @@ def steady_state(*, rtol: float = 1e-4, atol: float = 1e-6) -> dfx.Event:
         >>> bool(solution.ts[-1] < 20)
         True
     """
-    return dfx.Event(dfx.steady_state_event(rtol, atol, optx.rms_norm))
+    real(rtol, "rtol", least=0, below=1)
+    real(atol, "atol", least=0)
+    return dfx.Event(_Steady(numbers_as_arrays(rtol), numbers_as_arrays(atol)))
 
 
-# --- saving, closing, reporting ------------------------------------------------------------
+class _Steady(eqx.Module):
+    """True where the rate is small. Its numbers are leaves: others compile nothing."""
+
+    rtol: Array
+    atol: Array
+
+    def __call__(self, t, y, args, *, terms, solver, **_):
+        rate = solver.func(terms, t, y, args)
+        return root_mean_square(rate) < self.atol + self.rtol * root_mean_square(y)
 
 
-def _is_sub(x) -> bool:
-    return isinstance(x, dfx.SubSaveAt)
+# --- what came of it -----------------------------------------------------------------------
 
 
-def _subs(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
-    return [s for s in jax.tree.leaves(saveat.subs, is_leaf=_is_sub) if _is_sub(s)]
-
-
-def _stores_steps(saveat: dfx.SaveAt) -> bool:
-    return saveat.dense or any(sub.steps for sub in _subs(saveat))
-
-
-class _Closed(eqx.Module):
-    """What is saved of a state, from the state with its boundary values."""
-
-    problem: AbstractEvolution
-    what: Callable
-
-    def __call__(self, t, y, args):
-        return self.what(t, self.problem.closed(t, y), args)
-
-
-def _state(t, y, args):
-    return y
-
-
-def _closed(saveat: dfx.SaveAt, problem: AbstractEvolution) -> dfx.SaveAt:
-    """The same saves with boundary values filled in."""
-
-    def closed(sub):
-        return eqx.tree_at(lambda s: s.fn, sub, _Closed(problem, sub.fn))
-
-    subs = jax.tree.map(closed, saveat.subs, is_leaf=_is_sub)
-    return eqx.tree_at(lambda s: s.subs, saveat, subs, is_leaf=lambda x: x is None)
-
-
-def _with_last(saveat: dfx.SaveAt, problem: AbstractEvolution) -> dfx.SaveAt:
-    """The same saves and the last state in any case."""
-    subs = (saveat.subs, dfx.SubSaveAt(t1=True, fn=_Closed(problem, _state)))
-    return eqx.tree_at(lambda s: s.subs, saveat, subs, is_leaf=lambda x: x is None)
-
-
-def _finished(run: Run, solution: dfx.Solution, throw: bool) -> dfx.Solution:
+def _finished(plan: Plan, run: Run, throw: bool) -> dfx.Solution:
     """The solution as asked for; an error with the last good state if it ended early."""
+    solution, verdict = solve(run)
     assert solution.ts is not None and solution.ys is not None
     (ts, (t_last,)), (ys, last) = solution.ts, solution.ys
     stats = dict(solution.stats)
-    if run.concrete:
-        stats["solver"] = run.why if run.why != "given" else f"{type(run.solver).__name__}: given"
+    if plan.concrete:
+        stats["solver"] = plan.why
+        stats["summary"] = _summary(plan, solution, float(t_last))
+    else:
+        stats.pop("max_steps")  # nothing but a number of ours
     solution = eqx.tree_at(
         lambda s: (s.ts, s.ys, s.stats), solution, (ts, ys, stats), is_leaf=lambda x: x is None
     )
     good = (dfx.RESULTS.successful, dfx.RESULTS.event_occurred)
-    if not throw or not run.concrete or any(solution.result == r for r in good):
+    if not plan.concrete or any(solution.result == r for r in good):
+        return solution
+    if verdict is not None and not bool(verdict.stable):
+        if throw:
+            raise ValueError(_unstable(plan.name, run, verdict))
+        return solution
+    _check_start(run)
+    if not throw:
         return solution
     t, state = float(t_last), jax.tree.map(lambda leaf: leaf[-1], last)
-    raise IntegrationError(_reason(run, solution, t, state), solution, t, state)
+    raise IntegrationError(_reason(plan, run, solution, t, state), solution, t, state)
 
 
-def _reason(run: Run, solution: dfx.Solution, t: float, state) -> str:
+def _summary(plan: Plan, solution: dfx.Solution, t: float) -> str:
+    accepted, refused = (
+        int(solution.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected")
+    )
+    end = float(plan.run.t1)
+    reached = f"t = {t:g}" if t == end else f"t = {t:g} of {end:g}"
+    return f"{plan.name}: {accepted} steps ({refused} refused) to {reached}"
+
+
+def _unstable(name: str, run: Run, verdict: Verdict) -> str:
+    assert run.tableau is not None and run.dt0 is not None
+    dt, span = abs(float(run.dt0)), abs(float(run.t1 - run.t0))
+    limit, radius = verdict.longest(run.tableau, dt, span)
+    return (
+        f"dt0 = {dt:g} is unstable: {name} is stable up to {limit:.3g}, the spectral radius of the "
+        f"right-hand side is {radius:.3g}; longer steps multiply its fastest mode by "
+        f"{float(jnp.exp(verdict.excess)):.3g} each. Shorter steps, no dt0 (steps are then "
+        "adapted), or js.RKC2() or js.IMEX()"
+    )
+
+
+def _check_start(run: Run) -> None:
+    """Raise if the run failed because there was no rate to start with."""
+    parts = run.terms.terms if isinstance(run.terms, dfx.MultiTerm) else (run.terms,)
+    for term in parts:
+        for leaf in jax.tree.leaves(eqx.filter_jit(term.vf)(run.t0, run.u0, run.args)):
+            values = np.asarray(leaf)
+            message = "the right-hand side at point {i} is not finite: {v}"
+            raise_at(bad_rows(values), message, values)
+
+
+def _reason(plan: Plan, run: Run, solution: dfx.Solution, t: float, state) -> str:
     steps, rejected = (
         int(solution.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected")
     )
@@ -250,8 +250,10 @@ def _reason(run: Run, solution: dfx.Solution, t: float, state) -> str:
     reason = next((text for code, text in why if solution.result == code), None)
     if reason is None:
         reason = f"a linear system was not solved ({dfx.RESULTS[solution.result]})"  # type: ignore[misc]
+    if float(run.limit) < jnp.inf:
+        reason += f" (no solution of this problem grows, and this one would be > {run.limit:.3g})"
     return (
-        f"{type(run.solver).__name__} stopped at t = {t:.6g} of {float(run.t1):.6g}: {reason}. "
+        f"{plan.name} stopped at t = {t:.6g} of {float(run.t1):.6g}: {reason}. "
         f"{steps} steps were accepted and {rejected} refused; the last good state has values up to "
         f"{largest:.3g} and is kept as `state` of this error"
     )

@@ -4,19 +4,27 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ..arguments import is_concrete
+from ..arguments import as_float, finite, instance, is_concrete
 from ..boundary import Closure
 from ..stencils.stencil import AbstractOperator, Stencil
+from .coefficients import (
+    InTime,
+    check_closure,
+    check_mass,
+    check_operator,
+    coefficient,
+    function,
+    number,
+    user,
+)
 
 Field = Float[Array, "n *c"]
-InTime = ArrayLike | Callable[[Any], Any]
 
 
 class AbstractEvolution(eqx.Module):
@@ -48,6 +56,36 @@ class AbstractEvolution(eqx.Module):
     """
 
     conditions: eqx.AbstractVar[Closure | None]
+
+    @property
+    def diffusive(self) -> bool:
+        """True if it cannot be integrated backwards in time."""
+        return False
+
+    @property
+    def contractive(self) -> bool:
+        """True if no solution grows in the root mean square."""
+        return False
+
+    def __repr__(self):
+        """The parts that there are, in a line."""
+        parts = []
+        for name, value in vars(self).items():
+            if isinstance(value, AbstractOperator):
+                parts.append(f"{name}=<{type(value).__name__} on {value.n} points>")
+            elif isinstance(value, Closure):
+                parts.append(f"{name}=<Closure of {value.m} points>")
+            elif eqx.is_array(value):
+                plain = value.ndim == 0 and is_concrete(value)
+                text = f"{float(value):g}" if plain else f"<{value.dtype} {value.shape}>"
+                parts.append(f"{name}={text}")
+            elif callable(value):
+                parts.append(
+                    f"{name}=<function {getattr(value, '__name__', '')}>".replace(" >", ">")
+                )
+            elif value is not None:
+                parts.append(f"{name}={value!r}")
+        return f"{type(self).__name__}({', '.join(parts)})"
 
     @abc.abstractmethod
     def linear(self, t, u: PyTree[Field]) -> PyTree[Field]:
@@ -149,35 +187,57 @@ class AdvectionDiffusionReaction(AbstractEvolution):
     ):
         if laplacian is None and velocity is None:
             raise ValueError("neither a laplacian nor a velocity: nothing moves the field")
-        _check_mass(mass, conditions)
-        self.laplacian, self.diffusivity = laplacian, diffusivity
-        self.reaction, self.stabilization = reaction, stabilization
-        self.conservative, self.conditions, self.mass = conservative, conditions, mass
+        n = check_operator(laplacian, "laplacian")
+        n = check_operator(gradient, "gradient", n, out=None)
+        check_operator(stabilization, "stabilization", n)
+        check_closure(conditions, n)
+        self.laplacian, self.diffusivity = laplacian, coefficient(diffusivity, "diffusivity", 0)
+        self.reaction, self.stabilization = function(reaction, "reaction"), stabilization
+        self.conservative, self.conditions = bool(conservative), conditions
+        self.mass = check_mass(mass, conditions, n)
         self.advection, self.gradient, self.velocity = None, None, None
         if velocity is not None:
             if gradient is None:
                 raise ValueError("a velocity needs the surface gradient, pass `gradient`")
+            instance(gradient, Stencil, "gradient", "from js.surface_gradient")
             if callable(velocity):
                 self.gradient, self.velocity = gradient, velocity
             else:  # one stencil of scalars does the work of d
                 self.advection = _along(gradient, velocity, conservative)
 
+    @property
+    def moving(self) -> bool:
+        """True with a velocity."""
+        return self.advection is not None or self.velocity is not None
+
+    @property
+    def diffusive(self):
+        return self.laplacian is not None
+
+    @property
+    def contractive(self):
+        compressed = self.moving and self.conservative
+        return self.reaction is None and self.conditions is None and not compressed
+
     def linear(self, t, u):
         if self.laplacian is None:
             return jnp.zeros_like(u)
-        return _balanced(_diffused(self.laplacian, _at(self.diffusivity, t), u), self.mass)
+        return _balanced(
+            _diffused(self.laplacian, _at(self.diffusivity, "diffusivity", t), u), self.mass
+        )
 
     def rest(self, t, u, args):
         rate = jnp.zeros_like(u)
         if self.advection is not None:
             rate = rate - self.advection(u)
         if self.velocity is not None and self.gradient is not None:
-            rate = rate - _advected(self.gradient, self.velocity(t), u, self.conservative)
+            v = user(self.velocity, "velocity", t)
+            rate = rate - _advected(self.gradient, v, u, self.conservative)
         if self.stabilization is not None:
             rate = rate + self.stabilization(u)
         rate = _balanced(rate, self.mass if self.conservative else None)
         if self.reaction is not None:
-            rate = rate + _same_shape(self.reaction(t, u, args), u, "reaction")
+            rate = rate + _same_shape(user(self.reaction, "reaction", t, u, args), u, "reaction")
         return rate
 
 
@@ -207,13 +267,34 @@ class BiharmonicDiffusion(AbstractEvolution):
     """
 
     laplacian: AbstractOperator
-    stiffness: ArrayLike = eqx.field(kw_only=True, default=1.0)
-    reaction: Callable | None = eqx.field(kw_only=True, default=None)
-    conditions: Closure | None = eqx.field(kw_only=True, default=None)
-    mass: Float[Array, " n"] | None = eqx.field(kw_only=True, default=None)
+    stiffness: ArrayLike
+    reaction: Callable | None
+    conditions: Closure | None
+    mass: Float[Array, " n"] | None
 
-    def __check_init__(self):
-        _check_mass(self.mass, self.conditions)
+    def __init__(
+        self,
+        laplacian: AbstractOperator,
+        *,
+        stiffness: ArrayLike = 1.0,
+        reaction: Callable | None = None,
+        conditions: Closure | None = None,
+        mass: Float[Array, " n"] | None = None,
+    ):
+        n = check_operator(laplacian, "laplacian", needed=True)
+        check_closure(conditions, n)
+        self.laplacian, self.conditions = laplacian, conditions
+        self.stiffness = number(stiffness, "stiffness", 0)
+        self.reaction = function(reaction, "reaction")
+        self.mass = check_mass(mass, conditions, n)
+
+    @property
+    def diffusive(self):
+        return True
+
+    @property
+    def contractive(self):
+        return self.reaction is None and self.conditions is None
 
     def linear(self, t, u):
         inner = _homogeneous(self.conditions, self.laplacian(u))
@@ -222,7 +303,7 @@ class BiharmonicDiffusion(AbstractEvolution):
     def rest(self, t, u, args):
         if self.reaction is None:
             return jnp.zeros_like(u)
-        return _same_shape(self.reaction(t, u, args), u, "reaction")
+        return _same_shape(user(self.reaction, "reaction", t, u, args), u, "reaction")
 
 
 class CahnHilliard(AbstractEvolution):
@@ -254,15 +335,37 @@ class CahnHilliard(AbstractEvolution):
     """
 
     laplacian: AbstractOperator
-    width: ArrayLike = eqx.field(kw_only=True)
-    mobility: ArrayLike = eqx.field(kw_only=True, default=1.0)
-    potential: Callable = eqx.field(kw_only=True, default=lambda u: u**3 - u)
-    splitting: ArrayLike = eqx.field(kw_only=True, default=2.0)
-    conditions: Closure | None = eqx.field(kw_only=True, default=None)
-    mass: Float[Array, " n"] | None = eqx.field(kw_only=True, default=None)
+    width: ArrayLike
+    mobility: ArrayLike
+    potential: Callable
+    splitting: ArrayLike
+    conditions: Closure | None
+    mass: Float[Array, " n"] | None
 
-    def __check_init__(self):
-        _check_mass(self.mass, self.conditions)
+    def __init__(
+        self,
+        laplacian: AbstractOperator,
+        *,
+        width: ArrayLike,
+        mobility: ArrayLike = 1.0,
+        potential: Callable = lambda u: u**3 - u,
+        splitting: ArrayLike = 2.0,
+        conditions: Closure | None = None,
+        mass: Float[Array, " n"] | None = None,
+    ):
+        n = check_operator(laplacian, "laplacian", needed=True)
+        check_closure(conditions, n)
+        if function(potential, "potential") is None:
+            raise TypeError("potential is None, expected a function of u")
+        self.laplacian, self.conditions, self.potential = laplacian, conditions, potential
+        self.width = number(width, "width", 0)
+        self.mobility = number(mobility, "mobility", 0)
+        self.splitting = number(splitting, "splitting", 0)
+        self.mass = check_mass(mass, conditions, n)
+
+    @property
+    def diffusive(self):
+        return True
 
     def _driven(self, potential):
         potential = _homogeneous(self.conditions, potential)
@@ -272,12 +375,15 @@ class CahnHilliard(AbstractEvolution):
         return self._driven(self.splitting * u - self.width**2 * self.laplacian(u))
 
     def rest(self, t, u, args):
-        return self._driven(self.potential(u) - self.splitting * u)
+        return self._driven(self._force(u) - self.splitting * u)
 
     def rate(self, t, u, args):
         # In one pass: two applications of the Laplacian, not three.
         u = self.closed(t, u)
-        return self._free(self._driven(self.potential(u) - self.width**2 * self.laplacian(u)))
+        return self._free(self._driven(self._force(u) - self.width**2 * self.laplacian(u)))
+
+    def _force(self, u):
+        return _same_shape(user(self.potential, "potential", u), u, "potential")
 
 
 class WaveEquation(AbstractEvolution):
@@ -307,11 +413,28 @@ class WaveEquation(AbstractEvolution):
     """
 
     laplacian: AbstractOperator
-    speed: InTime = eqx.field(kw_only=True, default=1.0)
-    damping: InTime = eqx.field(kw_only=True, default=0.0)
-    forcing: Callable | None = eqx.field(kw_only=True, default=None)
-    stabilization: AbstractOperator | None = eqx.field(kw_only=True, default=None)
-    conditions: Closure | None = eqx.field(kw_only=True, default=None)
+    speed: InTime
+    damping: InTime
+    forcing: Callable | None
+    stabilization: AbstractOperator | None
+    conditions: Closure | None
+
+    def __init__(
+        self,
+        laplacian: AbstractOperator,
+        *,
+        speed: InTime = 1.0,
+        damping: InTime = 0.0,
+        forcing: Callable | None = None,
+        stabilization: AbstractOperator | None = None,
+        conditions: Closure | None = None,
+    ):
+        n = check_operator(laplacian, "laplacian", needed=True)
+        check_operator(stabilization, "stabilization", n)
+        check_closure(conditions, n)
+        self.laplacian, self.stabilization, self.conditions = laplacian, stabilization, conditions
+        self.speed, self.damping = coefficient(speed, "speed"), coefficient(damping, "damping")
+        self.forcing = function(forcing, "forcing")
 
     def closed(self, t, u):
         if self.conditions is None:
@@ -324,24 +447,26 @@ class WaveEquation(AbstractEvolution):
 
     def linear(self, t, u):
         value, velocity = u
-        speed = _per_point(_at(self.speed, t), value)
+        speed = _per_point(_at(self.speed, "speed", t), value)
         return velocity, speed**2 * self.laplacian(value)
 
     def rest(self, t, u, args):
         value, velocity = u
-        rate = -_per_point(_at(self.damping, t), velocity) * velocity
+        rate = -_per_point(_at(self.damping, "damping", t), velocity) * velocity
         if self.stabilization is not None:
             rate = rate + self.stabilization(velocity)
         if self.forcing is not None:
-            rate = rate + _same_shape(self.forcing(t, value, args), value, "forcing")
+            rate = rate + _same_shape(
+                user(self.forcing, "forcing", t, value, args), value, "forcing"
+            )
         return jnp.zeros_like(value), rate
 
 
 # --- pieces --------------------------------------------------------------------------------
 
 
-def _at(value: InTime, t):
-    return value(t) if callable(value) else value
+def _at(value: InTime, name: str, t):
+    return user(value, name, t) if callable(value) else value
 
 
 def _add(a: PyTree, b: PyTree) -> PyTree:
@@ -353,6 +478,11 @@ def _per_point(values: ArrayLike, field: Array, keep: int = 0) -> Array:
     values = jnp.asarray(values)
     if values.ndim == 0:
         return values
+    if values.shape[0] != field.shape[0]:
+        raise ValueError(
+            f"a coefficient has shape {values.shape}, expected a number or one for each of "
+            f"{field.shape[0]} points"
+        )
     missing = (1,) * (field.ndim - 1 - keep)
     return values.reshape(values.shape[0], *missing, *values.shape[1:])
 
@@ -391,7 +521,7 @@ def _homogeneous(conditions, u: Field) -> Field:
 
 
 def _same_shape(value, u: Field, name: str) -> Array:
-    value = jnp.asarray(value)
+    value = as_float(value, f"what {name} returns")
     if value.shape != u.shape:
         raise ValueError(f"{name} returns shape {value.shape}, the field has {u.shape}")
     return value
@@ -413,16 +543,7 @@ def _advected(gradient: Stencil, velocity, u: Field, conservative: bool) -> Fiel
 
 
 def _checked_velocity(velocity, gradient: Stencil) -> Array:
-    velocity, want = jnp.asarray(velocity), (gradient.n, *gradient.out_shape)
+    velocity, want = as_float(velocity, "velocity"), (gradient.n, *gradient.out_shape)
     if velocity.shape != want:
         raise ValueError(f"velocity has shape {velocity.shape}, expected {want}")
-    return velocity
-
-
-def _check_mass(mass, conditions) -> None:
-    if mass is None:
-        return
-    if conditions is not None:
-        raise ValueError("`mass` is for closed systems: with boundary conditions it may change")
-    if is_concrete(mass) and not bool(jnp.sum(mass) > 0):
-        raise ValueError(f"the weights of the mass add up to {float(jnp.sum(mass))}, not to > 0")
+    return finite(velocity, "velocity")

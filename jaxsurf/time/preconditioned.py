@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float
 
+from ..arguments import instance
 from ..solve.precondition import Multigrid
 from ..solve.shifted import ShiftedMultigrid, shifted_multigrid
 from ..solve.system import Square, matrix_free
@@ -100,6 +101,8 @@ def step_preconditioner(problem: AbstractEvolution, u0: Float[Array, "n *c"]) ->
         >>> bool(jnp.abs(u - jnp.exp(-0.4) * u0).max() < 0.01)
         True
     """
+    hint = "like AdvectionDiffusionReaction(laplacian)"
+    instance(problem, AbstractEvolution, "problem", hint)
     laplacian = getattr(problem, "laplacian", None)
     if isinstance(problem, AdvectionDiffusionReaction) and laplacian is not None:
         d = problem.diffusivity
@@ -110,8 +113,14 @@ def step_preconditioner(problem: AbstractEvolution, u0: Float[Array, "n *c"]) ->
         numbers = (problem.mobility, problem.splitting, problem.width)
         shifts = Partial(_cahn_hilliard, *map(jnp.asarray, numbers))
     else:
-        raise ValueError(f"there is no preconditioner for the steps of {type(problem).__name__}")
+        kind = type(problem).__name__
+        raise ValueError(
+            f"there is no preconditioner for problem = {kind}: it has no diffusion, or none known"
+        )
     assert laplacian is not None
+    if not hasattr(u0, "shape") or u0.ndim not in (1, 2) or u0.shape[0] != laplacian.n:
+        shape = u0.shape if hasattr(u0, "shape") else type(u0).__name__
+        raise ValueError(f"u0 is {shape}, expected an array ({laplacian.n},) or ({laplacian.n}, c)")
     hierarchy = shifted_multigrid(laplacian, conditions=problem.conditions)
     return StepPreconditioner(hierarchy, shifts, jnp.shape(u0))
 

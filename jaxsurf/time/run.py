@@ -3,18 +3,22 @@ r"""What an integration consists of: terms, solver and controller that go togeth
 from __future__ import annotations
 
 import logging
-from typing import Any
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, PyTree
 
-from ..arguments import as_float, is_concrete, raise_at
+from ..arguments import instance, is_concrete, real, whole
+from ..functions import canonical, numbers_as_arrays
+from .asked import check_coefficients, check_saves, checked_rate, checked_state, checked_times
 from .chebyshev import Loop
 from .explicit import RKC2
+from .guard import Guard, guarded
 from .implicit import IMEX
 from .pde import (
     AbstractEvolution,
@@ -23,6 +27,8 @@ from .pde import (
     CahnHilliard,
     WaveEquation,
 )
+from .stability import Tableau, Verdict, check_steps, tableau_of
+from .states import root_mean_square
 
 _log = logging.getLogger(__name__)
 
@@ -30,6 +36,10 @@ _log = logging.getLogger(__name__)
 _CHECKPOINTS = 64
 # A step this much shorter than the whole interval means that something diverges.
 _SHORTEST = 1e-11
+# Steps that are allowed when the number that are stored does not grow with it, and otherwise.
+_MANY_STEPS, _STORED_STEPS = 10_000_000, 4096
+# Where no solution grows, one that does by this factor is none.
+_GROWN = 100.0
 
 
 def choose_solver(problem: AbstractEvolution) -> tuple[dfx.AbstractSolver, str]:
@@ -45,77 +55,184 @@ def choose_solver(problem: AbstractEvolution) -> tuple[dfx.AbstractSolver, str]:
     Returns:
         The solver and a sentence.
 
+    Raises:
+        TypeError: not a problem in time.
+
     Example:
         >>> js.choose_solver(js.WaveEquation(js.laplace_beltrami(js.sphere(500))))[1]
         'Tsit5: waves are not stiff'
     """
+    _problem(problem)
     if isinstance(problem, WaveEquation):
         return dfx.Tsit5(), "Tsit5: waves are not stiff"
     if isinstance(problem, BiharmonicDiffusion | CahnHilliard):
         return IMEX(order=3), "IMEX(order=3): fourth order in space is too stiff for explicit steps"
     if isinstance(problem, AdvectionDiffusionReaction):
-        moving = problem.advection is not None or problem.velocity is not None
         if problem.laplacian is None:
-            return dfx.Tsit5(), "Tsit5: advection is not stiff"
-        if moving:
+            note = f"; {UNDAMPED}" if undamped(problem) else ""
+            return dfx.Tsit5(), f"Tsit5: advection is not stiff{note}"
+        if problem.moving:
             return IMEX(order=3), "IMEX(order=3): advection explicit, diffusion implicit"
         return RKC2(), "RKC2: diffusion, by explicit steps with many stages"
     return IMEX(order=3), "IMEX(order=3): a linear part of unknown stiffness"
 
 
-class Run(eqx.Module):
-    """Everything `diffeqsolve` takes, checked and in one precision."""
+UNDAMPED = (
+    "without diffusion or damping short waves may grow on scattered points: see "
+    "`stabilization=`, `hyperviscosity` and `upwinding`"
+)
 
-    problem: AbstractEvolution
+
+def undamped(problem: AbstractEvolution) -> bool:
+    """True for advection with nothing that damps short waves."""
+    if not isinstance(problem, AdvectionDiffusionReaction):
+        return False
+    return problem.laplacian is None and problem.stabilization is None
+
+
+class Run(eqx.Module):
+    """Everything that is compiled: arrays, and programs that are equal if they compute the same."""
+
     terms: PyTree
     solver: dfx.AbstractSolver
-    why: str = eqx.field(static=True)
     t0: Array
     t1: Array
     dt0: Array | None
     u0: PyTree[Array]
     args: Any
     controller: dfx.AbstractStepSizeController
+    limit: Array
+    saveat: dfx.SaveAt
+    event: dfx.Event | None
     adjoint: dfx.AbstractAdjoint
-    concrete: bool = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
+    progress: bool = eqx.field(static=True)
+    throw: bool = eqx.field(static=True)
 
-    @classmethod
-    def of(cls, problem, u0, t0, t1, solver, dt0, rtol, atol, controller, adjoint, args) -> Run:
-        u0 = jax.tree.map(as_float, u0)
-        real = jnp.finfo(jnp.result_type(*jax.tree.leaves(u0))).dtype
-        t0, t1 = jnp.asarray(t0, real), jnp.asarray(t1, real)
-        dt0 = None if dt0 is None else jnp.asarray(dt0, real)
-        leaves = jax.tree.leaves((problem, u0, t0, t1, args))
-        concrete = is_concrete(*leaves)
-        if is_concrete(t0, t1, dt0):
-            _check_times(t0, t1, dt0)
-        if concrete:
-            _check_state(problem, t0, u0, args)
-        why = "given"
-        if solver is None:
-            solver, why = choose_solver(problem)
-        adjoint = dfx.RecursiveCheckpointAdjoint(_CHECKPOINTS) if adjoint is None else adjoint
-        if isinstance(solver, RKC2):
-            solver = _looped(solver, adjoint)
-        if controller is None and dt0 is None:
-            shortest = _SHORTEST * jnp.abs(t1 - t0)
-            controller = dfx.PIDController(rtol, atol, dtmin=shortest, force_dtmin=False)
-        elif controller is None:
-            controller = dfx.ConstantStepSize()
-        if not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
-            controller = Guarded(controller)
-        _log.info("%s over [%s, %s] by %s", type(problem).__name__, t0, t1, why)
-        return cls(
-            problem, _terms(problem, solver), solver, why, t0, t1, dt0,
-            u0, args, controller, adjoint, concrete,
+    def over(self, u0, t0, t1, saveat: dfx.SaveAt) -> Run:
+        """The same from another state over another time."""
+        times = (jnp.asarray(t, self.t0.dtype) for t in (t0, t1))
+        new = (jax.tree.map(jnp.asarray, u0), *times, saveat)
+        return eqx.tree_at(lambda run: (run.u0, run.t0, run.t1, run.saveat), self, new)
+
+    @property
+    def tableau(self) -> Tableau | None:
+        """Of the steps, if they are explicit and of given length: these can be unstable."""
+        adaptive = isinstance(self.controller, dfx.AbstractAdaptiveStepSizeController)
+        return None if adaptive or self.dt0 is None else tableau_of(self.solver)
+
+
+class Plan(NamedTuple):
+    """A run and what is told of it.
+
+    Args:
+        run: as it is compiled.
+        name: of the solver.
+        why: it was chosen.
+        concrete: nothing is traced, so that results can be looked at.
+    """
+
+    run: Run
+    name: str
+    why: str
+    concrete: bool
+
+
+@eqx.filter_jit
+def solve(run: Run) -> tuple[dfx.Solution, Verdict | None]:
+    """The integration, and whether its steps were stable; one program for all numbers."""
+    verdict, refused = None, jnp.asarray(False)
+    if run.tableau is not None:
+        span = run.t1 - run.t0
+        rate = run.terms.vf
+        verdict = check_steps(run.tableau, rate, run.t0, run.u0, run.args, run.dt0, span)
+        refused = ~verdict.stable
+    solution = dfx.diffeqsolve(
+        run.terms,
+        run.solver,
+        run.t0,
+        run.t1,
+        run.dt0,
+        run.u0,
+        run.args,
+        saveat=run.saveat,
+        stepsize_controller=guarded(run.controller, Guard(run.limit, refused)),
+        adjoint=run.adjoint,
+        event=run.event,
+        max_steps=run.max_steps,
+        throw=run.throw,
+        progress_meter=dfx.TqdmProgressMeter() if run.progress else dfx.NoProgressMeter(),
+    )
+    return solution, verdict
+
+
+def planned(
+    problem, u0, t0, t1, solver, dt0, rtol, atol, controller, saveat, event, adjoint, args,
+    max_steps, progress, throw,
+) -> Plan:  # fmt: skip
+    """Check all that `integrate` is given, and bring it into the form that is compiled."""
+    _problem(problem)
+    u0 = checked_state(problem, u0)
+    t0, t1, dt0 = checked_times(problem, u0, t0, t1, dt0)
+    args = numbers_as_arrays(args)
+    for value, kind, name in (
+        (solver, dfx.AbstractSolver, "solver"), (event, dfx.Event, "event"),
+        (controller, dfx.AbstractStepSizeController, "controller"),
+        (adjoint, dfx.AbstractAdjoint, "adjoint"), (saveat, dfx.SaveAt, "saveat"),
+    ):  # fmt: skip
+        if value is not None:
+            instance(value, kind, name, f"an object of diffrax or jaxsurf, like {_LIKE[name]}")
+    why = "given"
+    if solver is None:
+        solver, why = choose_solver(problem)
+    name = type(solver).__name__
+    adjoint = dfx.RecursiveCheckpointAdjoint(_CHECKPOINTS) if adjoint is None else adjoint
+    if isinstance(solver, RKC2):
+        solver = _looped(solver, adjoint)
+    if controller is None and dt0 is None:
+        _check_tolerances(rtol, atol, t0.dtype)
+        controller = dfx.PIDController(rtol, atol, dtmin=_shortest(t0, t1), force_dtmin=False)
+    elif controller is None:
+        controller = dfx.ConstantStepSize()
+    saveat = check_saves(dfx.SaveAt(t1=True) if saveat is None else saveat, t0, t1)
+    allowed = _allowed(max_steps, saveat, t0, t1, dt0, controller)
+    check_coefficients(problem, t0, t1)
+    arrays = numbers_as_arrays(problem)
+    now = (t0, u0, args)
+    terms = _terms(arrays, solver, now)
+    controller = _with_arrays(controller)
+    if event is not None and is_concrete(t0, t1) and t1 > t0:
+        told = dict(
+            terms=terms, solver=solver, t0=t0, t1=t1, dt0=dt0, saveat=saveat,
+            stepsize_controller=controller, max_steps=allowed,
         )  # fmt: skip
+        event = _ending(event, arrays, now, told)
+    saveat = _saving(saveat, arrays, now)
+    limit = _GROWN * root_mean_square(u0) if problem.contractive else jnp.asarray(jnp.inf, t0.dtype)
+    parts = (terms, solver, t0, t1, dt0, u0, args, controller, limit, saveat, event, adjoint)
+    concrete = is_concrete(*jax.tree.leaves(parts), jnp.zeros(()) + 0)  # also not inside a `jit`
+    _log.info("%s over [%s, %s] by %s", type(problem).__name__, t0, t1, why)
+    run = Run(*parts, allowed, bool(progress), bool(throw) and not concrete)
+    return Plan(run, name, f"{name}: given" if why == "given" else why, concrete)
 
 
-def _terms(problem: AbstractEvolution, solver: dfx.AbstractSolver):
+_LIKE = dict(
+    solver="js.RKC2()", event="js.steady_state()", controller="dfx.PIDController(...)",
+    adjoint="dfx.ForwardMode()", saveat="dfx.SaveAt(ts=...)",
+)  # fmt: skip
+
+
+def _problem(problem: Any) -> None:
+    hint = "like AdvectionDiffusionReaction(laplacian)"
+    instance(problem, AbstractEvolution, "problem", hint)
+
+
+def _terms(problem: AbstractEvolution, solver: dfx.AbstractSolver, now):
     """The right-hand side, in two parts for solvers that treat them differently."""
     if not _takes_two(solver):
-        return dfx.ODETerm(problem.rate)
-    return dfx.MultiTerm(dfx.ODETerm(problem.explicit_rate), dfx.ODETerm(problem.implicit_rate))
+        return dfx.ODETerm(canonical(checked_rate(problem.rate), *now))
+    parts = (problem.explicit_rate, lambda t, u, args: problem.implicit_rate(t, u, args))
+    return dfx.MultiTerm(*(dfx.ODETerm(canonical(checked_rate(part), *now)) for part in parts))
 
 
 def _takes_two(solver: dfx.AbstractSolver) -> bool:
@@ -132,54 +249,93 @@ def _looped(solver: RKC2, adjoint: dfx.AbstractAdjoint) -> RKC2:
     return RKC2(solver.spectral_radius, solver.max_stages, loop)
 
 
-class Guarded(dfx.AbstractStepSizeController):
-    """A controller of given steps that never accepts a state with entries that are not finite.
-
-    It stops there with a result code, and the state before stays. (An adaptive controller
-    refuses and shortens such steps by itself.)
-    """
-
-    controller: dfx.AbstractStepSizeController
-
-    def wrap(self, direction):
-        return Guarded(self.controller.wrap(direction))
-
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state):
-        keep, start, end, jump, new_state, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, state
-        )
-        leaves = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(y1_candidate)]
-        finite = jnp.all(jnp.stack(leaves))
-        result = dfx.RESULTS.where(finite, result, dfx.RESULTS.nonlinear_divergence)
-        return keep & finite, jnp.where(finite, start, t0), end, jump, new_state, result
+def _check_tolerances(rtol, atol, dtype) -> None:
+    least = 4 * float(jnp.finfo(dtype).eps)
+    real(rtol, "rtol", above=0, below=1)
+    real(atol, "atol", least=0)
+    if is_concrete(rtol) and rtol < least:
+        more = "" if dtype == jnp.float64 else ": for more digits set jax_enable_x64"
+        raise ValueError(f"rtol = {float(rtol):g}, {dtype} allows at least {least:.1e}{more}")
 
 
-# --- checks --------------------------------------------------------------------------------
+def _shortest(t0: Array, t1: Array) -> Array:
+    """A step that is not worth trying: much shorter than all, or lost in the time."""
+    lost = 4 * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    return jnp.maximum(_SHORTEST * jnp.abs(t1 - t0), lost)
 
 
-def _check_times(t0, t1, dt0) -> None:
-    for name, value in (("t0", t0), ("t1", t1), ("dt0", dt0)):
-        if value is not None and not bool(jnp.isfinite(value)):
-            raise ValueError(f"{name} = {float(value)} is not finite")
-    if dt0 is not None and not float(dt0 * jnp.sign(t1 - t0)) > 0 and t0 != t1:
-        raise ValueError(f"a step dt0 = {float(dt0)} does not lead from {float(t0)} to {float(t1)}")
+def _with_arrays(controller: dfx.AbstractStepSizeController):
+    """Tolerances as arrays; whole numbers stay, like coefficients that are zero."""
+    number = lambda x: jnp.asarray(x) if isinstance(x, float) else x
+    return jax.tree.map(number, controller)
 
 
-def _check_state(problem: AbstractEvolution, t0, u0, args) -> None:
-    for leaf in jax.tree.leaves(u0):
-        values = np.asarray(leaf)
-        raise_at(_bad_rows(values), "the state at point {i} is not finite: {v}", values)
-    rate = eqx.filter_jit(problem.rate)(t0, u0, args)
-    have, want = (str(jax.tree.structure(tree)) for tree in (rate, u0))
-    if have != want:
-        raise ValueError(f"the state is a {want}, its rate a {have}")
-    for leaf in jax.tree.leaves(rate):
-        values = np.asarray(leaf)
-        raise_at(_bad_rows(values), "the right-hand side at point {i} is not finite: {v}", values)
+def _allowed(max_steps, saveat: dfx.SaveAt, t0, t1, dt0, controller) -> int:
+    """The largest number of steps; an error if steps of given length are sure to be more."""
+    given = max_steps is not None
+    if given:
+        max_steps = whole(max_steps, "max_steps", least=1)
+    else:
+        max_steps = _STORED_STEPS if _stores_steps(saveat) else _MANY_STEPS
+    adaptive = isinstance(controller, dfx.AbstractAdaptiveStepSizeController)
+    if not given and dt0 is not None and not adaptive and is_concrete(t0, t1, dt0):
+        steps = float(jnp.abs((t1 - t0) / dt0))
+        if steps > max_steps + 1:
+            raise ValueError(
+                f"dt0 = {float(dt0):g} makes {steps:.3g} steps from {float(t0):g} to "
+                f"{float(t1):g}, at most {max_steps} are taken: a longer step, or `max_steps`"
+            )
+        if steps > _MANY_STEPS / 10:
+            warnings.warn(f"dt0 = {float(dt0):g} makes {steps:.3g} steps", stacklevel=4)
+    return max_steps
 
 
-def _bad_rows(values: np.ndarray) -> np.ndarray:
-    return ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+# --- what is saved, and what ends a run ----------------------------------------------------
+
+
+def _is_sub(x) -> bool:
+    return isinstance(x, dfx.SubSaveAt)
+
+
+def _stores_steps(saveat: dfx.SaveAt) -> bool:
+    subs = [s for s in jax.tree.leaves(saveat.subs, is_leaf=_is_sub) if _is_sub(s)]
+    return saveat.dense or any(sub.steps for sub in subs)
+
+
+_AS_IT_IS = dfx.SubSaveAt(t1=True).fn
+
+
+def closed(problem: AbstractEvolution, what: Callable, now) -> Callable:
+    """What is made of a state, from the state with its boundary values."""
+    if problem.conditions is None and what is _AS_IT_IS:
+        return what
+    return canonical(lambda t, y, args: what(t, problem.closed(t, y), args), *now)
+
+
+def _saving(saveat: dfx.SaveAt, problem: AbstractEvolution, now) -> dfx.SaveAt:
+    """The same saves with boundary values filled in, and the last state in any case."""
+    new = lambda sub: eqx.tree_at(lambda s: s.fn, sub, closed(problem, sub.fn, now))
+    subs = jax.tree.map(new, saveat.subs, is_leaf=_is_sub)
+    last = new(dfx.SubSaveAt(t1=True))
+    return eqx.tree_at(lambda s: s.subs, saveat, (subs, last), is_leaf=lambda x: x is None)
+
+
+class _Ending(eqx.Module):
+    """A condition that ends a run, as a program."""
+
+    value: Callable
+
+    def __call__(self, t, y, args, **_):
+        return self.value(t, y, args)
+
+
+def _ending(event: dfx.Event, problem: AbstractEvolution, now, told: dict) -> dfx.Event:
+    """The event with its functions as programs, of the state with its boundary values."""
+
+    def new(condition):
+        if isinstance(condition, eqx.Module):  # has numbers of its own as leaves
+            return condition
+        return _Ending(closed(problem, lambda t, y, args: condition(t, y, args, **told), now))
+
+    conditions = jax.tree.map(new, event.cond_fn, is_leaf=callable)
+    return eqx.tree_at(lambda e: e.cond_fn, event, conditions)

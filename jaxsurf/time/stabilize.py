@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from ..arguments import as_float, finite, instance, real, whole
 from ..cloud import PointCloud
 from ..neighbors import Neighbors, find_neighbors
 from ..operators import diffusion
@@ -12,6 +13,7 @@ from ..spectrum import spectral_estimate
 from ..stencils.dcpse import DCPSE
 from ..stencils.method import AbstractMethod
 from ..stencils.stencil import AbstractOperator, Stencil
+from .coefficients import check_operator
 
 
 def hyperviscosity(
@@ -40,7 +42,8 @@ def hyperviscosity(
         The damping, to be added to the right-hand side: `stabilization=` of the problems.
 
     Raises:
-        ValueError: a power below one, a strength that is not positive.
+        TypeError: not an operator, not numbers.
+        ValueError: a power below one, a strength or radius that is not positive, a negative speed.
 
     Example:
         >>> laplacian = js.laplace_beltrami(js.sphere(300))
@@ -49,11 +52,14 @@ def hyperviscosity(
         >>> bool(jnp.vdot(rough, damping(rough)) < 0)
         True
     """
-    if power < 1:
-        raise ValueError(f"power = {power}, at least 1 is needed")
-    if not strength > 0:
-        raise ValueError(f"strength = {strength}, a positive number is needed")
-    if spectral_radius is None:
+    check_operator(laplacian, "laplacian", needed=True)
+    instance(laplacian, Stencil, "laplacian", "from js.laplace_beltrami")
+    power = whole(power, "power", least=1)
+    real(strength, "strength", above=0)
+    real(speed, "speed", least=0)
+    if spectral_radius is not None:
+        real(spectral_radius, "spectral_radius", above=0)
+    else:
         spectral_radius = spectral_estimate(laplacian).radius
     factor = strength * jnp.asarray(speed) * spectral_radius ** (0.5 - power)
     damping: AbstractOperator = laplacian.scaled(-((-1) ** power) * factor)
@@ -80,7 +86,7 @@ def upwinding(
     Args:
         cloud: n points in d dimensions with unit normals.
         velocity: v, `(n, d)`.
-        neighbors: as `diffusion`.
+        neighbors: as `diffusion`; without them they are searched for on the host.
         method: how the weights are computed.
         strength: α.
 
@@ -99,13 +105,24 @@ def upwinding(
         >>> bool(jnp.vdot(x, damping(x)) < 0)
         True
     """
-    velocity = jnp.asarray(velocity)
+    instance(cloud, PointCloud, "cloud")
+    instance(method, AbstractMethod, "method", "like js.DCPSE(order=2)")
+    velocity = finite(as_float(velocity, "velocity"), "velocity")
     if velocity.shape != cloud.points.shape:
         raise ValueError(f"velocity has shape {velocity.shape}, expected {cloud.points.shape}")
+    real(strength, "strength", least=0)
     spacing = cloud.spacing
     if spacing is None:
-        from_nearest = find_neighbors(cloud, 2, throw=False)
-        offsets = cloud.points[from_nearest.indices[:, 1]] - cloud.points
-        spacing = jnp.linalg.norm(offsets, axis=1)
+        near = find_neighbors(cloud, 2, throw=False) if neighbors is None else neighbors
+        spacing = _nearest(cloud, near)
     speed = jnp.linalg.norm(velocity, axis=1)
     return diffusion(cloud, 0.5 * strength * spacing * speed, neighbors=neighbors, method=method)
+
+
+def _nearest(cloud: PointCloud, neighbors: Neighbors) -> Float[Array, " n"]:
+    """Distance to the nearest other point of each list."""
+    offsets = cloud.points[neighbors.indices] - cloud.points[:, None]
+    squares = jnp.sum(offsets**2, axis=-1)
+    other = neighbors.mask & (neighbors.indices != jnp.arange(cloud.n)[:, None])
+    # The largest where there is no other, so that nothing is divided by zero on the way back.
+    return jnp.sqrt(jnp.min(jnp.where(other, squares, jnp.max(squares)), axis=1))

@@ -1,0 +1,182 @@
+r"""What `integrate` asks of its arguments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from ..arguments import as_float, is_concrete, raise_at, real
+from ..boundary import check_border
+from ..stencils.stencil import AbstractOperator
+from .coefficients import user
+from .pde import AbstractEvolution, AdvectionDiffusionReaction, WaveEquation
+from .states import dtype_of
+
+
+def checked_state(problem: AbstractEvolution, u0: Any) -> PyTree[Array]:
+    """The state as arrays of floating-point numbers.
+
+    Raises:
+        TypeError: lists, numbers, complex fields.
+        ValueError: another number of points than the operators have, entries that are not finite.
+    """
+    pair = isinstance(problem, WaveEquation)
+    n = _points(problem)
+    size = "n" if n is None else n
+    want = f"a pair of arrays ({size}, ...)" if pair else f"an array ({size}, ...)"
+    if isinstance(u0, list) or u0 is None:
+        raise TypeError(f"u0 is a {type(u0).__name__}, expected {want}")
+    if pair and not (isinstance(u0, tuple) and len(u0) == 2):
+        raise TypeError(f"u0 is a {type(u0).__name__}, a wave needs {want}: values and velocities")
+    if n is not None and not pair and not hasattr(u0, "shape"):
+        raise TypeError(f"u0 is a {type(u0).__name__}, expected {want}")
+    u0 = jax.tree.map(lambda leaf: as_float(leaf, "u0"), u0)
+    leaves = jax.tree.leaves(u0)
+    if not leaves:
+        raise TypeError(f"u0 holds no arrays, expected {want}")
+    for leaf in leaves:
+        if leaf.ndim == 0 or leaf.size == 0:
+            raise ValueError(f"u0 has shape {leaf.shape}, expected {want}")
+        if n is not None and (leaf.shape[0] != n or leaf.ndim > 2):
+            raise ValueError(f"u0 has shape {leaf.shape}, expected ({n},) or ({n}, c)")
+        if is_concrete(leaf):
+            values = np.asarray(leaf)
+            raise_at(bad_rows(values), "the state at point {i} is not finite: {v}", values)
+    if pair and u0[0].shape != u0[1].shape:
+        shapes = f"{u0[0].shape} and {u0[1].shape}"
+        raise ValueError(f"u0 has shapes {shapes}, expected values and velocities of one shape")
+    if len({leaf.dtype for leaf in leaves}) > 1:
+        raise TypeError(f"u0 has entries of types {[str(leaf.dtype) for leaf in leaves]}, not one")
+    return u0
+
+
+def _points(problem: AbstractEvolution) -> int | None:
+    """Number of points, if the problem is one of ours."""
+    if type(problem).__module__.startswith(__package__):
+        for name in ("laplacian", "advection", "gradient"):
+            operator = getattr(problem, name, None)
+            if isinstance(operator, AbstractOperator):
+                return operator.n
+    return None
+
+
+def checked_times(problem: AbstractEvolution, u0, t0, t1, dt0):
+    """Times in the precision of the state.
+
+    Raises:
+        TypeError: not numbers.
+        ValueError: not finite; a first step in the other direction; diffusion backwards.
+    """
+    dtype = dtype_of(u0)
+    for name, value in (("t0", t0), ("t1", t1), ("dt0", dt0)):
+        if value is not None or name != "dt0":
+            real(value, name)
+    t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
+    dt0 = None if dt0 is None else jnp.asarray(dt0, dtype)
+    if not is_concrete(t0, t1):
+        return t0, t1, dt0
+    start, end = float(t0), float(t1)
+    if end < start and problem.diffusive:
+        raise ValueError(
+            f"t1 = {end:g} is before t0 = {start:g}: diffusion backwards in time has no solution"
+        )
+    if dt0 is not None and is_concrete(dt0) and not float(dt0) * np.sign(end - start) > 0:
+        if start != end:
+            raise ValueError(f"a step dt0 = {float(dt0)} does not lead from {start} to {end}")
+        if not float(dt0) > 0:
+            raise ValueError(f"dt0 = {float(dt0)}, expected above 0")
+    return t0, t1, dt0
+
+
+def checked_rate(rate: Callable) -> Callable:
+    """A right-hand side whose results are looked at: they must be like the state.
+
+    Raises:
+        ValueError: another structure or shape.
+        TypeError: another precision.
+    """
+
+    def checked(t, u, args):
+        found = jax.tree.map(jnp.asarray, rate(t, u, args))
+        have: Any = jax.tree.structure(found)
+        want: Any = jax.tree.structure(u)
+        if have != want:
+            raise ValueError(f"the state u0 is a {want}, its rate a {have}")
+        for y, k in zip(jax.tree.leaves(u), jax.tree.leaves(found)):
+            if y.shape != k.shape:
+                raise ValueError(f"the state u0 has shape {y.shape}, its rate {k.shape}")
+            if y.dtype != k.dtype:
+                raise TypeError(
+                    f"the state u0 is {y.dtype}, its rate {k.dtype} by the operators and "
+                    f"coefficients: bring them to one, as with u0.astype({k.dtype})"
+                )
+        return found
+
+    return checked
+
+
+def check_saves(saveat: dfx.SaveAt, t0, t1) -> dfx.SaveAt:
+    """The same, its times in the precision of the run.
+
+    Raises:
+        ValueError: times out of order or outside of the run.
+    """
+
+    def checked(sub):
+        if not isinstance(sub, dfx.SubSaveAt) or sub.ts is None:
+            return sub
+        ts = as_float(sub.ts, "saveat.ts").astype(t0.dtype)
+        if is_concrete(ts, t0, t1):
+            values, start, end = np.asarray(ts), float(t0), float(t1)
+            low, high = min(start, end), max(start, end)
+            out = ~((values >= low) & (values <= high))
+            raise_at(
+                out,
+                f"saveat.ts is {{v}} at entry {{i}}, expected within {low:g} and {high:g}",
+                values,
+            )
+            # (diffrax takes times in the order of the integration.)
+            falls = np.diff(values) * (1 if end >= start else -1) < 0
+            raise_at(falls, "saveat.ts turns back after entry {i} = {v}, expected in order", values)
+        return eqx.tree_at(lambda s: s.ts, sub, ts)
+
+    is_sub = lambda x: isinstance(x, dfx.SubSaveAt)
+    subs = jax.tree.map(checked, saveat.subs, is_leaf=is_sub)
+    return eqx.tree_at(lambda s: s.subs, saveat, subs, is_leaf=lambda x: x is None)
+
+
+def check_coefficients(problem: AbstractEvolution, t0, t1) -> None:
+    """Look at what could not be seen when the problem was made.
+
+    Raises:
+        ValueError: a diffusivity that is negative at the start or at the end; a border about which
+            nothing is said.
+    """
+    for name, operator in vars(problem).items():
+        if isinstance(operator, AbstractOperator) and name != "stabilization":
+            check_border(operator, problem.conditions)
+    if not isinstance(problem, AdvectionDiffusionReaction):
+        return
+    if callable(problem.diffusivity) and problem.laplacian is not None and is_concrete(t0, t1):
+        for t in (t0, t1):
+            values = (
+                np.asarray(d)
+                if is_concrete(d := user(problem.diffusivity, "diffusivity", t))
+                else np.zeros(())
+            )
+            if not (values >= 0).all():
+                raise ValueError(
+                    f"diffusivity is {values.min():g} at t = {float(t):g}, expected at least 0"
+                )
+
+
+def bad_rows(values: np.ndarray) -> np.ndarray:
+    """Which rows have an entry that is not finite."""
+    return ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)

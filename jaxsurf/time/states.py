@@ -1,0 +1,35 @@
+"""States in time as vectors: their size, and constants to differentiation."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+
+def length(y: PyTree[Array]) -> Float[Array, ""]:
+    """Euclidean norm of all entries."""
+    return jnp.sqrt(sum(jnp.sum(leaf * leaf) for leaf in jax.tree.leaves(y)))
+
+
+def root_mean_square(y: PyTree[Array]) -> Float[Array, ""]:
+    """Of all entries."""
+    return length(y) / max(sum(leaf.size for leaf in jax.tree.leaves(y)), 1) ** 0.5
+
+
+def frozen(tree: PyTree) -> PyTree:
+    """The same values, constants to differentiation."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+
+
+def small(y: PyTree[Array]) -> Float[Array, ""]:
+    """The length of a step for differences at a state, in the scale of the state."""
+    size = length(y)
+    dtype = jnp.result_type(*jax.tree.leaves(y))
+    return jnp.sqrt(jnp.finfo(dtype).eps) * jnp.where(size > 0, size, 1)
+
+
+def dtype_of(y: PyTree[Array]):
+    """The common type of all entries."""
+    return jnp.result_type(*jax.tree.leaves(y))

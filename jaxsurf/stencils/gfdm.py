@@ -56,6 +56,12 @@ class GFDM(AbstractMethod):
         return _SURFACE_COUNT[min(self.degree, 6)] if dim == 3 else 5 + 2 * self.degree
 
     def basis_size(self, dim, target):
+        if self.degree < target.order:
+            raise ValueError(
+                f"degree = {self.degree}: polynomials of degree at least {target.order} are needed "
+                f"for derivatives of order {target.order}, and so for the Laplacian by which "
+                "neighbours are chosen"
+            )
         return math.comb(dim - 1 + self.degree, self.degree)
 
     @property

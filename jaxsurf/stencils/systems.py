@@ -1,9 +1,9 @@
 r"""Linear algebra of the small systems: products with a basis, and symmetric solves.
 
 Two forms of the same operations. In *small* ones a vector over the basis is a list of arrays, and
-everything is straight-line code on its entries: a compiler turns that into loops over the points
-of a block, without ever storing a matrix. In large ones it is one array, and library calls do
-the work matrix by matrix.
+sums over the neighbours are straight-line code on its entries, which a compiler makes loops over
+the points of a block. Matrices are factored in loops over columns, all points at a time. In large
+ones a vector is one array, and library calls do the work matrix by matrix.
 
 Shapes: q points of a neighbourhood, c right-hand sides, m monomials, `*p` points of a block.
 """

@@ -236,6 +236,7 @@ def along(a):
 
 
 COEFFICIENTS = [
+    ("laplace_beltrami", "degree 1", lambda: js.laplace_beltrami(cloud(), lists(), method=js.GFDM(1)), ("degree = 1", "at least 2")),
     ("diffusion", "negative at one point", lambda: diffusion(changed(np.ones(N), 5, -0.25)), ("diffusivity of point 5", "-0.25", "at least 0")),
     ("diffusion", "NaN at one point", lambda: diffusion(changed(np.ones(N), 5, np.nan)), ("diffusivity", "point 5", "nan")),
     ("diffusion", "a number", lambda: diffusion(2.0), ("diffusivity", "()", f"({N},)")),

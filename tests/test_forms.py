@@ -1,0 +1,412 @@
+"""Operators in every form: at the prompt, in single precision, mapped, on curves, made by users."""
+
+import functools
+import tempfile
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxsurf as js
+
+from .helpers import (
+    check_derivative,
+    count_compilations,
+    exponential,
+    jittered_sphere,
+    random_sphere,
+    relative_error,
+)
+
+N, METHOD = 200, js.GFDM(degree=2)
+CLOUD = jittered_sphere(N)
+LISTS = js.find_neighbors(CLOUD, k=24)
+ARGS = {"neighbors": LISTS, "method": METHOD}
+U, GRADIENT, LAPLACIAN = exponential(CLOUD.points, (0.5, 1.0, 0.7))
+TENSOR = jnp.eye(3) * (2 + U)[:, None, None]
+
+OPERATORS = {
+    "laplace_beltrami": js.laplace_beltrami,
+    "surface_gradient": js.surface_gradient,
+    "surface_divergence": js.surface_divergence,
+    "biharmonic": js.biharmonic,
+    "diffusion": lambda c, **a: js.diffusion(c, (1 + c.points[:, 2] ** 2), **a),
+    "tensor": lambda c, **a: js.diffusion(c, c.points[:, :, None] * c.points[:, None], **a),
+    "directional_derivative": lambda c, **a: js.directional_derivative(c, c.points[:, ::-1], **a),
+}  # fmt: skip
+CURVATURES = {
+    "shape_tensor": js.shape_tensor,
+    "mean_curvature": js.mean_curvature,
+    "gauss_curvature": js.gauss_curvature,
+    "principal_curvatures": lambda c, **a: js.principal_curvatures(c, **a)[0],
+    "mean_curvature_vector": js.mean_curvature_vector,
+    "tube_ratio": lambda c, neighbors, **_: js.tube_ratio(c, neighbors),
+}
+
+
+def values(name, cloud, lists=LISTS, method=METHOD):
+    """What an operator makes of a field of the cloud, or a curvature."""
+    args = {"neighbors": lists, "method": method}
+    if name in CURVATURES:
+        return CURVATURES[name](cloud, **args)
+    operator = OPERATORS[name](cloud, **args)
+    u = jnp.sin(cloud.points @ jnp.asarray([1.0, 2.0, 1.5], cloud.points.dtype))
+    return operator(jnp.stack([u, u**2, jnp.cos(u)], axis=1) if operator.in_shape else u)
+
+
+def squeezed(points):
+    """Points of an ellipsoid and normals, both functions of the points of the sphere."""
+    axes = jnp.asarray([1.0, 1.2, 1.5], points.dtype)
+    normals = points / axes
+    return js.PointCloud(points * axes, normals / jnp.linalg.norm(normals, axis=1, keepdims=True))
+
+
+each = pytest.mark.parametrize("name", [*OPERATORS, *CURVATURES])
+
+
+@each
+def test_mapped(name):
+    """Under vmap as in a loop."""
+    scales = jnp.array([1.0, 1.3])
+
+    def f(scale):
+        cloud = squeezed(CLOUD.points)
+        return values(name, js.PointCloud(scale * cloud.points, cloud.normals))
+
+    expected = jnp.stack([f(s) for s in scales])
+    size = jnp.abs(expected).max()
+    # What is compiled within is shared by all of these tests; under jit of its own, nothing is.
+    np.testing.assert_allclose(jax.vmap(f)(scales), expected, atol=1e-10 * size)
+
+
+# Largest errors in single precision, as shares of the largest value: 1e-7 amplified by 1 / h for
+# every derivative, h = 0.25, and by the cancellation in a row.
+SINGLE = {"biharmonic": 2e-3}
+
+
+@each
+def test_single_precision(name):
+    """Without x64, JAX's default: nothing leaves float32."""
+    exact = values(name, squeezed(CLOUD.points))
+    with jax.enable_x64(False):
+        cloud = squeezed(jnp.asarray(np.asarray(CLOUD.points), jnp.float32))
+        lists = jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), LISTS)
+        found = values(name, cloud, lists)
+        assert found.dtype == jnp.float32
+        error = (
+            np.abs(np.asarray(found) - np.asarray(exact)).max() / np.abs(np.asarray(exact)).max()
+        )
+    assert error < SINGLE.get(name, 2e-4), error
+
+
+def test_gradients_in_single_precision():
+    """1e-3 of the derivative in double precision."""
+
+    def f(points):
+        return jnp.sum(values("laplace_beltrami", squeezed(points)) ** 2)
+
+    exact = jax.grad(f)(CLOUD.points)
+    with jax.enable_x64(False):
+        lists = jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), LISTS)
+        points = jnp.asarray(np.asarray(CLOUD.points), jnp.float32)
+        found = jax.grad(lambda x: jnp.sum(values("laplace_beltrami", squeezed(x), lists) ** 2))(
+            points
+        )
+        assert found.dtype == jnp.float32
+    assert relative_error(np.asarray(found, float), exact) < 1e-3
+
+
+def test_the_second_call_compiles_nothing():
+    """At the prompt: fields, batches, derivatives, transposes; another operator of these sizes."""
+    other = js.find_neighbors(jittered_sphere(N, seed=5), k=24)
+    found = [
+        (js.laplace_beltrami(c, n, method=METHOD), js.surface_gradient(c, n, method=METHOD))
+        for c, n in ((CLOUD, LISTS), (jittered_sphere(N, seed=5), other))
+    ]
+
+    def use(laplacian, gradient):
+        vectors = gradient(U)
+        laplacian(U), laplacian(vectors), (laplacian @ laplacian)(U)
+        laplacian.transpose()(U), gradient.transpose()(vectors)
+        laplacian.diagonal, laplacian.scaled(2.0), laplacian.shifted(-1.0)
+        jax.jvp(laplacian, (U,), (U,)), jax.vjp(gradient, U)[1](vectors)
+        jax.grad(lambda u: jnp.sum(laplacian(u) ** 2))(U)
+
+    use(*found[0])
+    with count_compilations() as names:
+        use(*found[0])
+        use(*found[1])
+    assert not names, names
+
+
+def test_another_geometry_compiles_nothing():
+    """Nor another coefficient, radius, or number of points whose neighbourhoods are adapted."""
+
+    def use(seed):
+        cloud = random_sphere(N, seed)
+        lists = js.choose_neighbors(cloud, method=METHOD)
+        fixed = js.find_neighbors(cloud, k=24)
+        for name in (*OPERATORS, *CURVATURES):
+            values(name, cloud, fixed)
+        radius = 0.5 + 0.01 * seed
+        js.search_neighbors(cloud.points, radius=radius, capacity=js.SearchCapacity(60, 150))
+        return lists.k, int(np.sum(np.asarray(lists.mask.sum(axis=1)) != 36))
+
+    first = use(1)
+    with count_compilations() as names:
+        second = use(2)
+    assert first[1] != second[1]  # so many were adapted
+    assert not names, names
+
+
+@pytest.mark.parametrize("method", [js.GFDM(degree=p) for p in range(2, 7)], ids=str)
+def test_every_polynomial_of_the_basis_is_exact(method):
+    """On a plane, all monomials up to the degree: Laplacian and gradient."""
+    degree = method.degree
+    a = np.stack(np.meshgrid(*[np.linspace(-1, 1, 14)] * 2), axis=-1).reshape(-1, 2)
+    a = a + np.random.default_rng(degree).uniform(-0.03, 0.03, a.shape)
+    up = np.tile([0.0, 0.0, 1.0], (len(a), 1))
+    cloud = js.PointCloud(np.c_[a, 0 * a[:, 0]], up)
+    lists = js.find_neighbors(cloud, k=method.neighbor_count(3))
+    laplacian = js.laplace_beltrami(cloud, lists, method=method)
+    check_monomials(laplacian, a, degree, second=True)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_every_polynomial_of_the_surface_basis_is_exact(order):
+    """DC-PSE on a plane: the Laplacian of all monomials of the tangents up to degree order + 1."""
+    method = js.DCPSE(order=order)
+    a = np.stack(np.meshgrid(*[np.linspace(-1, 1, 12)] * 2), axis=-1).reshape(-1, 2)
+    a = a + np.random.default_rng(order).uniform(-0.03, 0.03, a.shape)
+    up = np.tile([0.0, 0.0, 1.0], (len(a), 1))
+    cloud = js.PointCloud(np.c_[a, 0 * a[:, 0]], up)
+    lists = js.find_neighbors(cloud, k=method.neighbor_count(3))
+    check_monomials(js.laplace_beltrami(cloud, lists, method=method), a, order + 1, second=True)
+
+
+def check_monomials(operator, a, degree, *, second):
+    x, y = a.T
+    size = np.abs(np.asarray(operator.weights)).sum(axis=0).max()
+    for p in range(degree + 1):
+        for q in range(degree + 1 - p):
+            exact = p * (p - 1) * x ** max(p - 2, 0) * y**q + q * (q - 1) * x**p * y ** max(
+                q - 2, 0
+            )
+            error = np.abs(np.asarray(operator(x**p * y**q)) - exact).max()
+            assert error < 1e-10 * size, (p, q, error, size)
+
+
+def test_gradients_of_diffusion_in_each_argument():
+    """Scalar and tensor diffusivity, points, normals and field."""
+    points = CLOUD.points * jnp.array([1.0, 1.2, 1.5])
+
+    def total(points=points, normals=CLOUD.normals, d=1.5 + U, u=U, tensor=TENSOR):
+        cloud = js.PointCloud(points, normals)
+        parts = [js.diffusion(cloud, coefficient, **ARGS)(u) for coefficient in (d, tensor)]
+        return sum(jnp.sum(jnp.cos(jnp.arange(N)) * part) for part in parts) / 100
+
+    for name, x in (("points", points), ("normals", CLOUD.normals), ("d", 1.5 + U), ("u", U)):
+        check_derivative(lambda x, name=name: total(**{name: x}), x, step=1e-4)
+    check_derivative(lambda s: total(tensor=TENSOR * s[:, None, None]), 1 + 0 * U, step=1e-4)
+
+
+def test_gradients_on_plane_curves():
+    """Operators and curvature of a curve, in its points (normals follow) and in the field."""
+    angle = jnp.linspace(0, 2 * jnp.pi, 60, endpoint=False) + 0.02 * jnp.sin(7 * jnp.arange(60.0))
+    circle = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+    args = {"neighbors": js.find_neighbors(circle, k=9), "method": METHOD}
+
+    def total(points, u=jnp.sin(3 * angle)):
+        normals = points / jnp.array([1.0, 1.5]) ** 2
+        cloud = js.PointCloud(points, normals / jnp.linalg.norm(normals, axis=1, keepdims=True))
+        gradient = js.surface_gradient(cloud, **args)(u)
+        parts = [
+            js.laplace_beltrami(cloud, **args)(u),
+            js.surface_divergence(cloud, **args)(gradient),
+            js.diffusion(cloud, 2 + u, **args)(u),
+            js.directional_derivative(cloud, points, **args)(u),
+            js.mean_curvature(cloud, **args),
+        ]
+        return sum(jnp.sum(jnp.cos(jnp.arange(60)) * part) for part in parts) / 100
+
+    check_derivative(total, circle * jnp.array([1.0, 1.5]), step=1e-4)
+    check_derivative(functools.partial(total, circle * jnp.array([1.0, 1.5])), jnp.sin(3 * angle))
+
+
+class NearestPair(js.AbstractMethod):
+    """A user's own method: inverse squared distances, of no great accuracy."""
+
+    scale: float = eqx.field(static=True, default=4.0)
+
+    def neighbor_count(self, dim):
+        return 7
+
+    def basis_size(self, dim, target):
+        return 3
+
+    @property
+    def batch_size(self):
+        return 64
+
+    def weights(self, neighborhood, target):
+        r2 = neighborhood.squared
+        on = neighborhood.mask & (r2 > 0)
+        w = jnp.where(on, self.scale / jnp.where(on, r2, 1), 0) / jnp.sum(on, axis=0)
+        w = w.at[0].set(-jnp.sum(w[1:], axis=0))
+        zero = jnp.zeros(r2.shape[1:], r2.dtype)
+        support = jnp.sqrt(jnp.max(r2, axis=0))
+        return w, js.Diagnostics.of(neighborhood, zero + 1, zero, support, 0)
+
+
+def test_a_users_own_method():
+    operator = js.laplace_beltrami(CLOUD, method=NearestPair())
+    assert jnp.abs(operator(jnp.ones(N))).max() < 1e-10
+    z = CLOUD.points[:, 2]
+    assert relative_error(operator(z), -2 * z) < 0.5  # 4 / r² averages to the Laplacian
+    mask = js.find_neighbors(CLOUD, k=7)
+    slope = jax.grad(
+        lambda s: js.laplace_beltrami(
+            js.PointCloud(s * CLOUD.points, CLOUD.normals), mask, method=NearestPair()
+        )(z)[0]
+    )(1.0)
+    np.testing.assert_allclose(slope, -2 * operator(z)[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1e-120, 1e120])
+def test_units_of_any_size(scale):
+    """Points of size 1e120 or 1e-120, beyond what their third powers can hold."""
+    cloud = js.PointCloud(scale * CLOUD.points, CLOUD.normals)
+    lists = js.find_neighbors(cloud, k=24)
+    operator = js.laplace_beltrami(cloud, lists, method=METHOD)
+    plain = js.laplace_beltrami(CLOUD, LISTS, method=METHOD)(U)
+    np.testing.assert_allclose(scale * operator(scale * U), plain, rtol=1e-9, atol=1e-9)
+
+
+def test_round_off_of_the_input_does_not_matter():
+    """Points moved by 1e-15 and in another order of summation: the same up to round-off."""
+    lattice = js.sphere(N)  # many distances tie
+    moved = np.asarray(lattice.points) * (1 + 1e-15 * np.random.default_rng(0).normal(size=(N, 1)))
+    clouds = lattice, js.PointCloud(moved, lattice.normals)
+    lists = [js.choose_neighbors(cloud, method=METHOD) for cloud in clouds]
+    assert np.array_equal(lists[0].indices, lists[1].indices)
+    first, second = (js.laplace_beltrami(c, n, method=METHOD)(U) for c, n in zip(clouds, lists))
+    np.testing.assert_allclose(first, second, atol=1e-10 * float(jnp.abs(first).max()))
+
+
+def test_a_transpose_is_shifted_at_its_own_points():
+    """Slot 0 of a transpose need not be the point itself; a row may lack its own point."""
+    operator = js.laplace_beltrami(CLOUD, LISTS, method=METHOD).transpose()
+    assert bool(jnp.any(operator.indices[0] != jnp.arange(N)))
+    np.testing.assert_allclose(operator.shifted(3.0)(U), operator(U) + 3 * U, atol=1e-9)
+    ring = js.Stencil((jnp.arange(5)[None] + 1) % 5, jnp.ones((1, 5)))
+    u = jnp.arange(5.0)
+    np.testing.assert_allclose(ring.shifted(u)(u), jnp.roll(u, -1) + u * u)
+    with pytest.raises(Exception, match="outside jit"):
+        jax.jit(lambda s: s.shifted(1.0)(u))(ring).block_until_ready()
+
+
+def test_partial_derivatives_in_other_forms():
+    """Flat derivatives under vmap, and in single precision to 1e-4."""
+    a = np.stack(np.meshgrid(*[np.linspace(0, 1, 9)] * 2), axis=-1).reshape(-1, 2)
+    a = a + np.random.default_rng(0).uniform(-0.02, 0.02, a.shape)
+    lists = js.find_neighbors(a, k=20)
+    u = np.sin(a[:, 0] + 2 * a[:, 1])
+
+    def f(scale, a=a, u=u, lists=lists):
+        points = scale * jnp.asarray(a, jnp.asarray(u).dtype)
+        return js.partial_derivative(points, (1, 0), neighbors=lists)(u)
+
+    plain = f(1.0)
+    np.testing.assert_allclose(jax.vmap(f)(jnp.array([1.0, 2.0])), [plain, plain / 2], atol=1e-10)
+    with jax.enable_x64(False):
+        here = jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), lists)
+        found = f(1.0, u=jnp.asarray(u, jnp.float32), lists=here)
+        assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, plain, atol=1e-4)
+
+
+def test_where_no_neighbourhood_serves():
+    """Points on two close circles: no size gives the centre a share, and the user is told."""
+    cloud = js.sphere(14)
+    with pytest.warns(UserWarning, match=r"no neighbourhood of \d+ points serves _Flat.*point \d+"):
+        js.choose_neighbors(cloud, method=_Flat())
+
+
+class _Flat(NearestPair):
+    """Its centre has no weight whatever the neighbours."""
+
+    def weights(self, neighborhood, target):
+        w, diagnostics = super().weights(neighborhood, target)
+        return w.at[0].set(0), diagnostics
+
+
+def test_representations():
+    marked = js.PointCloud(CLOUD.points, CLOUD.normals, boundary=np.arange(N) < 9)
+    assert repr(CLOUD).startswith("PointCloud(200 points in 3-d, float64, spacing 0.")
+    assert repr(CLOUD).endswith(", closed)") and "9 on the border" in repr(marked)
+    assert repr(LISTS) == "Neighbors(200 points, 24 slots, 24 neighbours each)"
+    operator = js.surface_gradient(CLOUD, **ARGS)
+    assert repr(operator).startswith("Stencil(200 points, scalar to vector fields, 24 slots (")
+    assert "Composition(200 points, scalar to scalar fields" in repr(js.biharmonic(CLOUD, **ARGS))
+    jax.eval_shape(lambda c: repr(c) and c.points, CLOUD)  # traced ones have one too
+
+
+# --- properties ------------------------------------------------------------------------------
+
+few = settings(max_examples=8, derandomize=True, deadline=None, database=None)
+
+
+@few
+@given(seed=st.integers(0, 1000), k=st.integers(2, 12))
+def test_lists_follow_the_points(seed, k):
+    """Turned, moved, scaled or in another order, points have the same neighbours."""
+    rng = np.random.default_rng(seed)
+    x = np.asarray(random_sphere(40, seed).points)
+    lists = js.find_neighbors(js.PointCloud(x, x), k=k, throw=False)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    scale = 10.0 ** rng.uniform(-6, 6)
+    cloud = js.PointCloud(scale * (x @ turn.T), x @ turn.T)
+    assert np.array_equal(js.find_neighbors(cloud, k=k, throw=False).indices, lists.indices)
+    order = rng.permutation(40)
+    mixed = js.find_neighbors(js.PointCloud(x, x).permuted(order), k=k, throw=False)
+    assert np.array_equal(order[np.asarray(mixed.indices)], np.asarray(lists.indices)[order])
+
+
+@st.composite
+def stencils(draw):
+    rng = np.random.default_rng(draw(st.integers(0, 1000)))
+    out, given_ = draw(st.sampled_from([((), ()), ((3,), ()), ((), (3,)), ((2,), (3,))]))
+    weights = rng.normal(size=(4, *out, *given_, 7))
+    return js.Stencil(jnp.asarray(rng.integers(0, 7, (4, 7))), jnp.asarray(weights), out, given_)
+
+
+@few
+@given(operator=stencils(), seed=st.integers(0, 1000))
+def test_stencils_are_matrices(operator, seed):
+    """Linear, equal to the SciPy matrix, adjoint to the transpose, the same after save and load."""
+    rng = np.random.default_rng(seed)
+    u, w = (jnp.asarray(rng.normal(size=(7, *operator.in_shape))) for _ in range(2))
+    v = jnp.asarray(rng.normal(size=(7, *operator.out_shape)))
+    near = functools.partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-12)
+    near(operator(2 * u - w), 2 * operator(u) - operator(w))
+    near(operator.to_scipy() @ np.ravel(u), np.ravel(operator(u)))
+    near(jnp.vdot(v, operator(u)), jnp.vdot(operator.transpose()(v), u))
+    with tempfile.TemporaryDirectory() as folder:
+        operator.save(Path(folder) / "a.npz")
+        assert eqx.tree_equal(js.Stencil.load(Path(folder) / "a.npz"), operator)
+
+
+@few
+@given(seed=st.integers(0, 1000), scale=st.floats(1e-6, 1e6))
+def test_clouds_keep_what_they_are_given(seed, scale):
+    rng = np.random.default_rng(seed)
+    x = np.asarray(random_sphere(20, seed).points)
+    cloud = js.PointCloud(scale * x, x, boundary=rng.uniform(size=20) < 0.3)
+    order = rng.permutation(20)
+    again = cloud.permuted(order).permuted(np.argsort(order))
+    assert eqx.tree_equal(again, cloud) and np.array_equal(cloud.points, scale * x)

@@ -72,8 +72,8 @@ def choose_neighbors(
     else:
         needed = ~np.asarray(checked_mask(bound, cloud.n, "bound"))
     neighbors = _adapted(cloud, method, throw, needed)[0]
-    mask = neighbors.mask & jnp.asarray(needed)[:, None]
-    return Neighbors(neighbors.indices, mask, neighbors.radius)
+    mask = np.asarray(neighbors.mask) & needed[:, None]
+    return Neighbors(neighbors.indices, jnp.asarray(mask), neighbors.radius)
 
 
 def build(cloud, neighbors, method, target, throw) -> Stencil:
@@ -171,7 +171,7 @@ def _adapted(cloud, method, throw, needed=True):
         kept = [np.where(better, new, old) for new, old in zip(jax.tree.leaves(trial), kept)]
     _report(poor, best[: poor.size], border, chosen, method)
 
-    widest = max(k, chosen.max())
+    widest = int(max(k, chosen.max()))
     own = np.tile(np.arange(cloud.n, dtype=np.int32)[:, None], widest - k)
     all_indices = np.concatenate([np.asarray(neighbors.indices), own], axis=1)
     all_mask = np.pad(np.asarray(neighbors.mask), ((0, 0), (0, widest - k)))

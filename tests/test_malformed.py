@@ -12,7 +12,7 @@ import jaxsurf as js
 from . import malformed
 
 # What functions return or raise, and classes to be filled out by users.
-MADE_FOR_USERS = {"Diagnostics", "Eigenmodes", "IntegrationError", "Spectrum"} | {
+MADE_FOR_USERS = {"Diagnostics", "Eigenmodes", "IntegrationError", "SearchCapacity", "Spectrum"} | {
     name for name in vars(js) if name.startswith("Abstract")
 }
 

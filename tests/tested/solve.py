@@ -1,0 +1,99 @@
+"""Steady problems, eigenmodes, distances."""
+
+_RESULT = "(made by eigenmodes)"
+
+TESTED = {
+    "solve": {
+        "value": "test_steady.py::test_poisson_on_the_closed_sphere_converges, "
+        "test_steady.py::test_screened_anisotropic_and_helmholtz",
+        "gradient": {
+            "weights": "test_steady.py::test_derivatives_in_weights_and_right_hand_side",
+            "rhs": "test_steady.py::test_derivatives_in_weights_and_right_hand_side",
+            "conditions": "test_steady.py::test_derivatives_with_conditions_and_jacobi",
+            "points": "test_steady.py::test_derivative_in_the_geometry",
+        },
+        "jit": "test_steady.py::test_no_retracing_for_other_values",
+        "vmap": "test_steady.py::test_several_right_hand_sides_and_transformations",
+        "float32": "test_steady.py::test_single_precision",
+        "bad input": "malformed",
+    },
+    "solve_nonlinear": {
+        "value": "test_newton.py::test_known_solution_in_few_steps",
+        "gradient": {"all": "test_newton.py::test_derivatives"},
+        "jit": "test_newton.py::test_derivatives",
+        "vmap": None,
+        "float32": None,
+        "bad input": "malformed",
+    },
+    "eigenmodes": {
+        "value": "test_eigen.py::test_groups_of_the_sphere",
+        "gradient": {
+            "weights": "test_eigen.py::test_derivative_of_simple_values, "
+            "test_eigen.py::test_derivative_of_simple_functions",
+            "conditions": "test_eigen.py::test_derivative_in_the_conditions",
+        },
+        "jit": "test_eigen.py::test_under_jit_and_vmap",
+        "vmap": "test_eigen.py::test_under_jit_and_vmap",
+        "float32": "test_eigen.py::test_single_precision",
+        "bad input": "malformed",
+    },
+    "Eigenmodes": {
+        "value": "test_eigen.py::test_groups_of_the_sphere",
+        "gradient": _RESULT,
+        "jit": _RESULT,
+        "vmap": _RESULT,
+        "float32": _RESULT,
+        "bad input": _RESULT,
+    },
+    "geodesic_distance": {
+        "value": "test_geodesic.py::test_sphere",
+        "gradient": {
+            "points": "test_geodesic.py::test_gradient_in_points_and_normals",
+            "normals": "test_geodesic.py::test_gradient_in_points_and_normals",
+        },
+        "jit": "test_geodesic.py::test_gradient_in_points_and_normals",
+        "vmap": None,
+        "float32": None,
+        "bad input": "malformed",
+    },
+    "BiCGStab": {
+        "value": "test_steady.py::test_poisson_on_the_closed_sphere_converges",
+        "gradient": "(derivatives of solve are implicit)",
+        "jit": "test_steady.py::test_no_retracing_for_other_values",
+        "vmap": "test_steady.py::test_several_right_hand_sides_and_transformations",
+        "float32": "test_steady.py::test_single_precision",
+        "bad input": "malformed",
+    },
+    "multigrid": {
+        "value": "test_precondition.py::test_one_cycle_damps_every_error",
+        "gradient": "(not differentiated: derivatives of solve are implicit)",
+        "jit": "(host only: concrete arrays)",
+        "vmap": "(host only: concrete arrays)",
+        "float32": "test_precondition.py::test_cycle_is_linear_and_its_transpose_exact",
+        "bad input": "malformed",
+    },
+    "Multigrid": {
+        "value": "test_precondition.py::test_cycle_is_linear_and_its_transpose_exact",
+        "gradient": "(not differentiated: derivatives of solve are implicit)",
+        "jit": "test_precondition.py::test_cycle_under_transformations",
+        "vmap": "test_precondition.py::test_cycle_under_transformations",
+        "float32": "test_precondition.py::test_cycle_is_linear_and_its_transpose_exact",
+        "bad input": "malformed",
+    },
+    "jacobi": {
+        "value": "test_precondition.py::test_jacobi_is_the_diagonal",
+        "gradient": "(not differentiated: derivatives of solve are implicit)",
+        "jit": "test_steady.py::test_derivatives_with_conditions_and_jacobi",
+        "vmap": None,
+        "float32": None,
+        "bad input": "malformed",
+    },
+    "Jacobi": {
+        "value": "test_precondition.py::test_jacobi_is_the_diagonal",
+        "gradient": "(not differentiated: derivatives of solve are implicit)",
+        "jit": "test_steady.py::test_derivatives_with_conditions_and_jacobi",
+        "vmap": None,
+        "float32": None,
+        "bad input": "malformed",
+    },
+}

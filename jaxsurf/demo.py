@@ -78,7 +78,7 @@ def built_in_surface(n: int = 10_000, *, thickness: float = 0.4) -> Surface:
 
 
 @jax.jit
-def _thickened(cloud: PointCloud, thickness: Float[Array, ""]) -> PointCloud:
+def _thickened(cloud: PointCloud, thickness: float | Float[Array, ""]) -> PointCloud:
     """The chosen points carried along to tubes of another thickness."""
     phi = double_torus(thickness)[0]
     points = project_to_level_set(phi, cloud.points)
@@ -100,7 +100,7 @@ def surface_from_file(path: str | Path, n: int | None = 10_000) -> Surface:
     return Surface(cloud, title, ("scale of all points", 1.0), moved, up, view)
 
 
-def _scaled(cloud: PointCloud, scale: Float[Array, ""]) -> PointCloud:
+def _scaled(cloud: PointCloud, scale: float | Float[Array, ""]) -> PointCloud:
     return eqx.tree_at(lambda c: c.points, cloud, scale * cloud.points)
 
 

@@ -169,11 +169,15 @@ def test_module_and_version():
 def test_growth_is_not_healthy():
     """An unstable run or a wrong gradient must not end with exit code 0."""
 
-    class Result:
+    class Result(demo.Demo):
         stable, disagreement = True, 1e-9
 
-    assert demo.healthy(Result)
+        def __init__(self):
+            pass
+
+    result = Result()
+    assert demo.healthy(result)
     Result.stable = False
-    assert not demo.healthy(Result)
+    assert not demo.healthy(result)
     Result.stable, Result.disagreement = True, float("nan")
-    assert not demo.healthy(Result)
+    assert not demo.healthy(result)

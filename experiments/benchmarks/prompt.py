@@ -186,7 +186,7 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
 
 
 def _nonlinear(u, args):
-    return u + args * u**3
+    return -u - args * u**3
 
 
 def one(name: str, n: int) -> dict:

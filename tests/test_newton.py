@@ -11,18 +11,14 @@ import jaxsurf as js
 
 from .helpers import check_derivative
 
-# Minutes in all.
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def problem():
-    cloud = js.sphere(1_000)
+    cloud = js.sphere(600)
     operator = js.laplace_beltrami(cloud).scaled(-1.0)
     return cloud, operator, js.multigrid(operator.shifted(1.0))
 
 
-@pytest.mark.core
 def test_known_solution_in_few_steps(problem):
     cloud, operator, _ = problem
     z = cloud.points[:, 2]
@@ -106,3 +102,22 @@ def test_failures_speak(problem):
         js.solve_nonlinear(operator, lambda u, _: u, (0 * z).at[4].set(np.inf))
     with pytest.raises(ValueError, match=r"u0 has shape \(3,\)"):
         js.solve_nonlinear(operator, lambda u, _: u, jnp.zeros(3))
+
+
+def test_a_reaction_that_couples_points(problem):
+    """Its whole derivative counts, in values and in gradients: here one by a stencil."""
+    cloud, operator, preconditioner = problem
+    z = cloud.points[:, 2]
+    # r(u) = u + u³ + (mean of neighbours of u²).
+    near = js.Stencil(operator.indices[:8], jnp.full((8, cloud.n), 0.1))
+
+    def total(strength, rhs):
+        found = js.solve_nonlinear(
+            operator, lambda u, a: u + u**3 + a * near(u**2), 0 * z, args=strength, rhs=rhs,
+            preconditioner=preconditioner, rtol=1e-13,
+        )  # fmt: skip
+        return jnp.sum(found.value**3 * z)
+
+    strength, rhs = 1 + z**2, 3 * z + z**3
+    check_derivative(lambda a: total(a, rhs), strength, step=1e-2)
+    check_derivative(lambda f: total(strength, f), rhs, step=1e-2)

@@ -10,15 +10,12 @@ import pytest
 import jaxsurf as js
 from jaxsurf.solve.system import Inverse, System
 
-from .helpers import check_derivative, exponential, relative_error
-
-# Minutes in all.
-pytestmark = pytest.mark.slow
+from .helpers import check_derivative, count_compilations, exponential, relative_error
 
 
 @pytest.fixture(scope="module")
 def sphere():
-    cloud = js.sphere(1_500)
+    cloud = js.sphere(1_000)
     laplacian = js.laplace_beltrami(cloud)
     return cloud, laplacian, js.multigrid(laplacian)
 
@@ -29,10 +26,10 @@ def _mean_free(u):
 
 @pytest.mark.parametrize(
     "method, order, bound",
-    [(js.DCPSE(order=2), 2, 1e-3), (js.DCPSE(order=4), 4, 5e-6), (js.GFDM(degree=3), 2, 1.3e-3)],
+    [(js.DCPSE(order=2), 2, 4e-3), (js.DCPSE(order=4), 4, 8.9e-6), (js.GFDM(degree=3), 2, 5.2e-3)],
 )
 def test_poisson_on_the_closed_sphere_converges(method, order, bound):
-    sizes, errors = [2_000, 8_000], []
+    sizes, errors = ([1_500, 6_000] if order == 4 else [500, 2_000]), []
     for n in sizes:
         cloud = js.sphere(n)
         u, _, f = exponential(cloud.points)
@@ -66,11 +63,10 @@ def test_biharmonic(sphere):
     assert relative_error(found.value, z) < 5e-3
 
 
-@pytest.mark.core
 def test_mean_zero_sense(sphere):
     cloud, laplacian, preconditioner = sphere
     z = cloud.points[:, 2]
-    found = js.solve(laplacian, -2 * z + 3.0, preconditioner=preconditioner)
+    found = js.solve(laplacian, -2 * z + 3.0, preconditioner=preconditioner, project=True)
     # The incompatible part is reported, and the rest is solved for.
     assert abs(float(found.stats["incompatible"]) - 3) < 1e-8
     assert abs(float(jnp.mean(found.value))) < 1e-14
@@ -78,13 +74,15 @@ def test_mean_zero_sense(sphere):
     assert float(jnp.linalg.norm(left)) < 1.5e-8 * float(jnp.linalg.norm(-2 * z + 3.0))
     # The sign of the operator does not matter, nor does the preconditioner.
     other = js.solve(
-        laplacian.scaled(-1.0), 2 * z - 3.0, preconditioner=js.jacobi(laplacian.scaled(-1.0))
+        laplacian.scaled(-1.0),
+        2 * z - 3.0,
+        preconditioner=js.jacobi(laplacian.scaled(-1.0)),
+        project=True,
     )
     np.testing.assert_allclose(other.value, found.value, atol=1e-6)
     assert abs(float(other.stats["incompatible"]) + 3) < 1e-6
 
 
-@pytest.mark.core
 def test_conditions_are_met_and_equations_hold_elsewhere(sphere):
     cloud, laplacian, _ = sphere
     z = cloud.points[:, 2]
@@ -129,7 +127,6 @@ def test_no_retracing_for_other_values(sphere):
     assert traces == 1
 
 
-@pytest.mark.core
 def test_derivatives_in_weights_and_right_hand_side(sphere):
     cloud, laplacian, preconditioner = sphere
     z = cloud.points[:, 2]
@@ -138,7 +135,8 @@ def test_derivatives_in_weights_and_right_hand_side(sphere):
 
     def total(weights, f):
         operator = eqx.tree_at(lambda o: o.weights, laplacian, weights)
-        found = js.solve(operator, f, preconditioner=preconditioner, rtol=1e-13)
+        # Scaled rows ask for another mean of f.
+        found = js.solve(operator, f, preconditioner=preconditioner, rtol=1e-13, project=True)
         return jnp.sum(weight * found.value**2)
 
     check_derivative(lambda f: total(laplacian.weights, f), f, step=1e-3)
@@ -207,11 +205,18 @@ def test_the_transposed_system_with_flux_conditions():
     one, other = jnp.vdot(v, inverse.mv(u)), jnp.vdot(inverse.transpose().mv(v), u)
     np.testing.assert_allclose(one, other, rtol=1e-11)
 
-    found = js.solve(laplacian, points[:, 0], conditions=conditions, preconditioner=preconditioner)
+    found = js.solve(
+        laplacian, points[:, 0], conditions=conditions, preconditioner=preconditioner, project=True
+    )
     assert abs(float(jnp.mean(found.value))) < 1e-13
     total = lambda f: jnp.sum(
         js.solve(
-            laplacian, f, conditions=conditions, preconditioner=preconditioner, rtol=1e-12
+            laplacian,
+            f,
+            conditions=conditions,
+            preconditioner=preconditioner,
+            rtol=1e-12,
+            project=True,
         ).value
         ** 2
     )
@@ -230,7 +235,7 @@ def test_no_square_array(sphere):
     assert f"{n},{n}" not in str(jaxpr)
 
 
-@pytest.mark.parametrize("n", [1_500, 12_000])
+@pytest.mark.parametrize("n", [1_500, 6_000])
 def test_steps_hardly_grow(n):
     cloud = js.sphere(n)
     neighbors = js.find_neighbors(cloud, k=20, throw=False)
@@ -252,7 +257,6 @@ def test_a_solver_of_lineax(sphere):
         js.solve(laplacian, -2 * z, preconditioner=preconditioner, solver=loose)
 
 
-@pytest.mark.core
 def test_failures_speak(sphere):
     cloud, laplacian, preconditioner = sphere
     z = cloud.points[:, 2]
@@ -267,7 +271,7 @@ def test_failures_speak(sphere):
     with pytest.raises(RuntimeError, match="below round-off"):
         js.solve(laplacian, z, rtol=1e-18)
     # Under jit the same is an error of the compiled program.
-    with pytest.raises(Exception, match=r"did not reach rtol = 1e-08"):
+    with pytest.raises(Exception, match=r"did not reach its tolerance"):
         solve = eqx.filter_jit(
             lambda f: js.solve(laplacian, f, preconditioner=preconditioner, max_steps=1).value
         )
@@ -286,13 +290,12 @@ def test_a_singular_system_is_an_error(sphere):
         js.solve(singular, f, preconditioner=js.jacobi(laplacian), max_steps=200)
 
 
-@pytest.mark.core
 def test_bad_input(sphere):
     cloud, laplacian, preconditioner = sphere
     z = cloud.points[:, 2]
     with pytest.raises(ValueError, match="right-hand side is not finite at point 9"):
         js.solve(laplacian, z.at[9].set(jnp.nan))
-    with pytest.raises(ValueError, match=r"shape \(3,\), expected \(1500,\) or \(1500, c\)"):
+    with pytest.raises(ValueError, match=r"shape \(3,\), expected \(1000,\) or \(1000, c\)"):
         js.solve(laplacian, jnp.zeros(3))
     with pytest.raises(ValueError, match=r"components"):
         js.solve(js.surface_gradient(cloud), z)
@@ -338,3 +341,64 @@ def test_single_precision():
     found = js.solve(operator, 3 * z, rtol=1e-4)
     assert found.value.dtype == jnp.float32
     assert float(jnp.abs(found.value - z).max()) < 5e-3
+
+
+def test_what_is_incompatible_is_an_error(sphere):
+    """On a closed surface the mean of f has to vanish, as far as the points resolve f."""
+    cloud, laplacian, preconditioner = sphere
+    z = cloud.points[:, 2]
+    solve = lambda f, **options: js.solve(laplacian, f, preconditioner=preconditioner, **options)
+    for f in (-2 * z + 0.05, jnp.ones(cloud.n), z**2, exponential(cloud.points)[0]):
+        with pytest.raises(ValueError, match=r"mean is .* explains .* at most.*project=True"):
+            solve(f)
+        kept = solve(f, throw=False)
+        assert kept.result == lx.RESULTS.singular
+        assert abs(kept.stats["incompatible"]) > 2 * kept.stats["compatible_within"]
+        assert solve(f, project=True).result == lx.RESULTS.successful
+    # Compatible ones are far from the bound, whatever the scale.
+    for f in (-2 * z, exponential(cloud.points)[2], -30 * z * (5 * z**2 - 3)):
+        stats = solve(f).stats
+        assert abs(stats["incompatible"]) < 0.2 * stats["compatible_within"]
+
+
+def test_numbers_of_any_size(sphere):
+    cloud, laplacian, preconditioner = sphere
+    f = -2 * cloud.points[:, 2]
+    one = js.solve(laplacian, f, preconditioner=preconditioner)
+    for size in (1e-300, 1e300):
+        found = js.solve(laplacian, size * f, preconditioner=preconditioner)
+        np.testing.assert_allclose(found.value / size, one.value, atol=1e-9)
+        assert int(found.stats["num_steps"]) == int(one.stats["num_steps"])
+    assert (
+        float(jnp.abs(js.solve(laplacian, 0 * f, preconditioner=preconditioner).value).max()) == 0
+    )
+
+
+def test_other_operators_and_tolerances_compile_nothing(sphere):
+    cloud, laplacian, _ = sphere
+    f = -2 * cloud.points[:, 2]
+    js.solve(laplacian, f)
+    other = js.ellipsoid(cloud.n, (1.0, 0.8, 0.6))
+    neighbors = js.find_neighbors(other, laplacian.k)
+    moved = js.laplace_beltrami(other, neighbors)
+    with count_compilations() as names:
+        js.solve(moved, f, project=True)
+        js.solve(laplacian, f, rtol=1e-6)
+        js.solve(laplacian, 2 * f, atol=1e-3, max_steps=50)
+        js.solve(laplacian.scaled(3.0), f, solver=js.BiCGStab(1e-9))
+    assert not [name for name in names if "solve" in name], names
+
+
+def test_default_tolerance_in_single_precision():
+    """JAX's default: the plain problem is solved, and what cannot be names the cure."""
+    cloud = js.sphere(1_000)
+    double = js.solve(js.laplace_beltrami(cloud, method=js.GFDM(degree=2)), -2 * cloud.points[:, 2])
+    single = js.PointCloud(cloud.points.astype(jnp.float32), cloud.normals.astype(jnp.float32))
+    with jax.enable_x64(False):
+        laplacian = js.laplace_beltrami(single, method=js.GFDM(degree=2))
+        z = single.points[:, 2]
+        found = js.solve(laplacian, -2 * z)
+        assert found.value.dtype == jnp.float32
+        assert np.abs(np.asarray(found.value) - np.asarray(double.value)).max() < 1e-3
+        with pytest.raises(RuntimeError, match=r"below round-off.*float32.*jax_enable_x64"):
+            js.solve(laplacian, -2 * z, rtol=1e-9)

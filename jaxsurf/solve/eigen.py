@@ -3,7 +3,6 @@ r"""Eigenmodes of an operator, computed on the host, with exact derivatives."""
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -11,13 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import is_concrete
+from ..arguments import instance, is_concrete, real, whole
+from ..boundary import Closure, check_border
 from ..stencils.stencil import AbstractOperator, check_scalar
 from . import invariant
 from .invariant import Subspace
-
-if TYPE_CHECKING:
-    from ..boundary import Closure
 
 
 class Eigenmodes(eqx.Module):
@@ -43,6 +40,17 @@ class Eigenmodes(eqx.Module):
     imaginary: Float[Array, " k"]
     residuals: Float[Array, " k"]
     groups: Int[Array, " k"]
+
+    def __repr__(self):
+        n, k = self.functions.shape
+        return f"Eigenmodes({k} modes of {n} points, {self._described()})"
+
+    def _described(self) -> str:
+        if not is_concrete(self.values, self.residuals):
+            return "traced"
+        values = ", ".join(f"{v:.4g}" for v in np.asarray(self.values)[:6])
+        more = ", ..." if len(self.values) > 6 else ""
+        return f"values {values}{more}, residuals up to {float(np.max(self.residuals)):.1e}"
 
 
 def eigenmodes(
@@ -81,8 +89,10 @@ def eigenmodes(
     round-off, of which then only symmetric functions (sums over the group) have derivatives.
     Functions: for single modes, and for the bases of groups as long as they stay groups.
     Raises:
+        TypeError: what is no operator or closure; a k that is no whole number.
         ValueError: an operator with components; k < 1 or too many modes for the points; a
-            group that goes on beyond the modes computed.
+            border without conditions, which gives modes that grow; a group that goes on beyond
+            the modes computed.
         RuntimeError: the iteration has not converged.
 
     Example:
@@ -90,7 +100,12 @@ def eigenmodes(
         >>> bool(jnp.allclose(modes.values, jnp.array([0.0, 2.0, 2.0, 2.0]), atol=0.01))
         True
     """
+    instance(operator, AbstractOperator, "operator", "js.laplace_beltrami(cloud) makes one")
     check_scalar(operator)
+    if conditions is not None:
+        instance(conditions, Closure, "conditions", "js.close(cloud, conditions) makes one")
+    check_border(operator, conditions)
+    k, degenerate = whole(k, "k"), float(real(degenerate, "degenerate", least=0, below=1))
     if not 1 <= k <= operator.n // 2:
         raise ValueError(f"k = {k} modes, between 1 and n / 2 = {operator.n // 2} can be computed")
     system = _System.of(operator, conditions)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import is_concrete
+from ..arguments import instance, is_concrete, real
 from ..boundary import close
 from ..build import choose_neighbors
 from ..cloud import PointCloud
@@ -80,12 +80,21 @@ def geodesic_distance(
         >>> bool(jnp.linalg.norm(distance - exact) < 0.02 * jnp.linalg.norm(exact))
         True
     """
+    instance(cloud, PointCloud, "cloud", "js.PointCloud(points, normals) makes one")
+    instance(method, AbstractMethod, "method", "like js.GFDM(degree=2)")
+    if neighbors is not None:
+        instance(neighbors, Neighbors, "neighbors", "js.find_neighbors(cloud, k) makes them")
+        if neighbors.n != cloud.n:
+            raise ValueError(f"neighbours of {neighbors.n} points, the cloud has {cloud.n}")
+    real(smoothing, "smoothing", above=0)
     sources = _source_indices(sources, cloud.n)  # type: ignore[assignment]
     if neighbors is None:
         neighbors = choose_neighbors(cloud, method=method)
     elif not is_concrete(neighbors.indices, neighbors.mask):
         raise ValueError("neighbours must be concrete arrays")
-    if rtol is None:
+    if rtol is not None:
+        real(rtol, "rtol", above=0, below=1)
+    else:
         rtol = float(jnp.finfo(cloud.points.dtype).eps) ** 0.6
 
     laplacian = laplace_beltrami(cloud, neighbors, method=method)
@@ -211,6 +220,11 @@ def _source_indices(sources, n: int) -> Int[np.ndarray, " m"]:
         if sources.shape != (n,):
             raise ValueError(f"mask of sources has shape {sources.shape}, expected ({n},)")
         sources = np.flatnonzero(sources)
+    elif sources.ndim != 1 or (sources.size and sources.dtype.kind not in "iu"):
+        raise TypeError(
+            f"sources is an array of {sources.dtype} of shape {sources.shape}, expected a mask or "
+            "indices"
+        )
     sources = np.unique(sources)
     if not sources.size:
         raise ValueError("no sources: at least one point is needed")

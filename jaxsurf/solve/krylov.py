@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..arguments import is_concrete, real, whole
 
 _Results = lx.RESULTS
 
@@ -24,6 +30,10 @@ class BiCGStab(lx.AbstractLinearSolver):
         atol: absolute tolerance.
         max_steps: most steps, of two products with the operator each.
 
+    Raises:
+        ValueError: a tolerance that is negative or not finite, or rtol ≥ 1; max_steps < 1.
+        TypeError: no numbers.
+
     Example:
         >>> import lineax as lx
         >>> operator = lx.MatrixLinearOperator(jnp.array([[2.0, 1.0], [0.0, 3.0]]))
@@ -32,9 +42,15 @@ class BiCGStab(lx.AbstractLinearSolver):
         True
     """
 
-    rtol: float = 1e-8
-    atol: float = 0.0
-    max_steps: int = 1000
+    rtol: Any = 1e-8
+    atol: Any = 0.0
+    max_steps: Any = 1000
+
+    def __check_init__(self):
+        real(self.rtol, "rtol", least=0, below=1)
+        real(self.atol, "atol", least=0)
+        if is_concrete(self.max_steps):
+            whole(self.max_steps, "max_steps", least=1)
 
     def init(self, operator, options):
         del options
@@ -46,37 +62,41 @@ class BiCGStab(lx.AbstractLinearSolver):
         preconditioner = options.get("preconditioner")
         apply = state.mv
         precondition = (lambda r: r) if preconditioner is None else preconditioner.mv
-        x = options.get("y0", jnp.zeros_like(vector))
-        target = jnp.maximum(self.rtol * jnp.linalg.norm(vector), self.atol)
+        # At size one, as squares of 1e-300 are zero.
+        scale = scale_of(vector)
+        b = vector / scale
+        target = jnp.maximum(self.rtol * jnp.linalg.norm(b), self.atol / scale)
+        x, r = jnp.zeros_like(b), b
+        if "y0" in options:
+            x = options["y0"] / scale
+            r = b - apply(x)
 
         def pass_(carry):
             """Steps until the recursive residual is small or cannot go on."""
-            x, r, size, _, steps, _ = carry
-            run = _Run.begin(x, r, steps)
+            x, r, size, steps, _ = carry
             run = jax.lax.while_loop(
                 lambda run: run.goes_on & (run.size > target) & (run.steps < self.max_steps),
                 lambda run: run.step(apply, precondition),
-                run,
+                _Run.begin(x, r, steps),
             )
-            r = vector - apply(run.x)
+            r = b - apply(run.x)
             now = jnp.linalg.norm(r)
             # A pass that gains little has met round-off, or a system that is singular.
-            return run.x, r, now, size, run.steps, now < 0.5 * size
+            return run.x, r, now, run.steps, now < 0.5 * size
 
         def unfinished(carry):
-            _, _, size, _, steps, gains = carry
+            _, _, size, steps, gains = carry
             return gains & (size > target) & (steps < self.max_steps)
 
-        r = vector - apply(x)
         size = jnp.linalg.norm(r)
-        start = (x, r, size, size, jnp.asarray(0), jnp.isfinite(size))
-        x, _, size, _, steps, _ = jax.lax.while_loop(unfinished, pass_, start)
+        start = (x, r, size, jnp.asarray(0), jnp.isfinite(size))
+        x, _, size, steps, _ = jax.lax.while_loop(unfinished, pass_, start)
         result = _Results.where(
             steps >= self.max_steps, _Results.max_steps_reached, _Results.stagnation
         )
         result = _Results.where(size <= target, _Results.successful, result)
         result = _Results.where(jnp.all(jnp.isfinite(vector)), result, _Results.nonfinite_input)
-        return x, result, {"num_steps": steps, "max_steps": self.max_steps}
+        return scale * x, result, {"num_steps": steps, "max_steps": self.max_steps}
 
     def transpose(self, state, options):
         turned = {}
@@ -89,6 +109,24 @@ class BiCGStab(lx.AbstractLinearSolver):
 
     def assume_full_rank(self):
         return True
+
+
+def scale_of(x: Float[Array, " n"]) -> Float[Array, ""]:
+    """The largest modulus; one if that is zero or no number."""
+    size = jnp.max(jnp.abs(x))
+    return jax.lax.stop_gradient(jnp.where((size > 0) & jnp.isfinite(size), size, 1))
+
+
+def norm(x: Float[Array, " n"]) -> Float[Array, ""]:
+    """The 2-norm, of tiny and of huge numbers too."""
+    scale = scale_of(x)
+    return scale * jnp.linalg.norm(x / scale)
+
+
+def numbers_as_arrays(solver):
+    """A solver with its tolerances as arrays: programs are then compiled once for all of them."""
+    kinds = (float, int) if isinstance(solver, BiCGStab) else float
+    return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, kinds) else x, solver)
 
 
 class _Run(eqx.Module):
@@ -115,17 +153,25 @@ class _Run(eqx.Module):
         rho = jnp.vdot(self.shadow, self.r)
         beta = (rho / self.rho) * (self.alpha / self.omega)
         p = self.r + beta * (self.p - self.omega * self.v)
-        p_hat = precondition(p)
-        v = apply(p_hat)
-        alpha = rho / jnp.vdot(self.shadow, v)
-        s = self.r - alpha * v
-        s_hat = precondition(s)
-        t = apply(s_hat)
-        omega = jnp.vdot(t, s) / jnp.vdot(t, t)
-        # s = 0 is the solution; then t = 0 as well.
-        omega = jnp.where(jnp.any(s != 0), omega, 0)
-        x = self.x + alpha * p_hat + omega * s_hat
-        r = s - omega * t
+
+        def half(i, carry):
+            """Along p as far as the shadow does not see the rest, then along that to its least.
+
+            One body for both, so that the operator and its preconditioner are compiled once.
+            """
+            x, r, v, alpha, _ = carry
+            first = i == 0
+            d_hat = precondition(jnp.where(first, p, r))
+            w = apply(d_hat)
+            other = jnp.where(first, self.shadow, w)
+            factor = jnp.where(first, rho, jnp.vdot(w, r)) / jnp.vdot(other, w)
+            # A residual of zero is the solution; then w = 0 as well.
+            factor = jnp.where(first | jnp.any(r != 0), factor, 0)
+            v, alpha = jnp.where(first, w, v), jnp.where(first, factor, alpha)
+            return x + factor * d_hat, r - factor * w, v, alpha, factor
+
+        start = (self.x, self.r, self.v, self.alpha, self.omega)
+        x, r, v, alpha, omega = jax.lax.fori_loop(0, 2, half, start)
         size = jnp.linalg.norm(r)
         # The shadow residual has to see the residual, and omega must not vanish.
         seen = jnp.abs(rho) > _eps(r) * jnp.linalg.norm(self.shadow) * self.size

@@ -14,13 +14,13 @@ import optimistix as optx
 import scipy.sparse
 from jaxtyping import Array, Float
 
-from ..arguments import is_concrete
+from ..arguments import as_float, is_concrete, whole
 from ..boundary import Closure
-from ..stencils.stencil import AbstractOperator, Stencil, check_scalar
-from .krylov import BiCGStab
+from ..stencils.stencil import AbstractOperator, Stencil
+from .krylov import BiCGStab, numbers_as_arrays
 from .padded import matching_layout
 from .precondition import AbstractPreconditioner, multigrid
-from .system import Inverse, System
+from .system import Inverse, Linearised, System, check_system, tolerance
 
 # A step is accepted if the residual falls by this share of what the linear model promises.
 _ARMIJO = 1e-4
@@ -42,7 +42,7 @@ def solve_nonlinear(
     conditions: Closure | None = None,
     preconditioner: AbstractPreconditioner | None = None,
     solver: lx.AbstractLinearSolver | None = None,
-    rtol: float = 1e-8,
+    rtol: float | None = None,
     atol: float = 0.0,
     max_steps: int = 30,
     throw: bool = True,
@@ -54,8 +54,8 @@ def solve_nonlinear(
 
     Args:
         operator: L, a scalar stencil or a composition.
-        reaction: `reaction(u, args)`, pointwise: the value at a point depends on u there. (What
-            depends on neighbours belongs in the operator.)
+        reaction: `reaction(u, args)`, as a rule pointwise. It may couple points: products with
+            its whole derivative are taken, only the preconditioner sees sums of rows.
         u0: where to start, `(n,)`.
         args: parameters of the reaction, any pytree; derivatives in them need them here.
         rhs: f, `(n,)` or a number.
@@ -63,7 +63,8 @@ def solve_nonlinear(
         preconditioner: for $L + r'$; `js.multigrid` of it at u0 if None, which takes concrete
             arrays. One serves all steps.
         solver: of the linear systems; `js.BiCGStab` if None, loosely but for derivatives.
-        rtol: the residual may be this share of its size at u0 (or of f, if that is larger).
+        rtol: the residual may be this share of its size at u0 (or of f, if that is larger);
+            1e-8 in double and 1e-4 in single precision if None.
         atol: or this, whichever is larger.
         max_steps: most Newton steps.
         throw: raise where the iteration fails; if False, see `result`.
@@ -76,8 +77,9 @@ def solve_nonlinear(
     Differentiable: forward and reverse, in the weights of the operator, args, rhs and the
     conditions, by one linear solve at the solution; not in u0.
     Raises:
-        ValueError: shapes that do not fit; values that are not finite; under `jit`, no
-            preconditioner.
+        TypeError: what is no operator, closure, preconditioner, solver or function; no numbers.
+        ValueError: shapes that do not fit; values that are not finite; a border without
+            conditions; under `jit`, no preconditioner.
         RuntimeError: no convergence (with steps and residual).
 
     Example:
@@ -89,14 +91,21 @@ def solve_nonlinear(
         >>> bool(jnp.abs(u - z).max() < 0.01)
         True
     """
-    check_scalar(operator)
-    u0 = jnp.asarray(u0)
+    check_system(operator, conditions, preconditioner, solver, atol)
+    if not callable(reaction):
+        raise TypeError(f"reaction is a {type(reaction).__name__}, expected a function (u, args)")
+    whole(max_steps, "max_steps", least=1)
+    u0, rhs = as_float(u0, "u0"), as_float(rhs, "right-hand side")
     u0 = u0.astype(jnp.result_type(u0, *jax.tree.leaves(operator), jnp.float32))
-    rhs = jnp.asarray(rhs, u0.dtype)
+    rhs, rtol = rhs.astype(u0.dtype), tolerance(rtol, u0.dtype)
     if u0.shape != (operator.n,) or rhs.shape not in ((), u0.shape):
         raise ValueError(
             f"u0 has shape {u0.shape} and the right-hand side {rhs.shape}, expected ({operator.n},)"
         )
+    given = jax.eval_shape(lambda u: reaction(u, args), u0)
+    if getattr(given, "shape", None) != u0.shape:
+        shape = getattr(given, "shape", type(given).__name__)
+        raise ValueError(f"reaction returns {shape}, expected an array of shape {u0.shape}")
     if is_concrete(u0, rhs) and not (np.isfinite(u0).all() and np.isfinite(rhs).all()):
         name, values = ("u0", u0) if not np.isfinite(u0).all() else ("right-hand side", rhs)
         i = int(np.argmin(np.isfinite(np.ravel(values))))
@@ -111,7 +120,9 @@ def solve_nonlinear(
         )
     layout = matching_layout(preconditioner.incoming, operator)
     concrete = is_concrete(*jax.tree.leaves((problem, u0, preconditioner)))
-    limits = (rtol, atol, max_steps, throw and not concrete)
+    numbers = np.asarray(rtol), np.asarray(float(atol)), np.asarray(max_steps)
+    solver = None if solver is None else numbers_as_arrays(solver)
+    limits = (*numbers, throw and not concrete)
     solution = _solve(problem, u0, layout, preconditioner, solver, *limits)
     if throw and concrete and bool(solution.result != optx.RESULTS.successful):
         raise RuntimeError(
@@ -147,7 +158,8 @@ class _Problem(eqx.Module):
     def correction(self, v, residual, layout, preconditioner, solver):
         """The solution of (L + r') delta = residual; what it is linearised at is a constant."""
         fixed, v = _constant((self, v))
-        operator, conditions = _shifted(fixed.operator, fixed.slope(v)), fixed.conditions
+        slope = _Slope(fixed.reaction, fixed.args, fixed.field(v))
+        operator, conditions = Linearised(fixed.operator, slope), fixed.conditions
         system = System.of(operator, conditions, layout, v.dtype, False)
         options = {"preconditioner": _constant(Inverse(preconditioner, system))}
         return lx.linear_solve(system, residual, solver, options=options, throw=False)
@@ -166,7 +178,8 @@ class _State(eqx.Module):
 def _solve(problem, u0, layout, preconditioner, solver, rtol, atol, max_steps, throw):
     fixed = _constant(problem)
     loose = BiCGStab(_FORCING, 0.0, 1000) if solver is None else solver
-    tight = BiCGStab(min(rtol, 1e-8), 0.0, 1000) if solver is None else solver
+    finest = tolerance(None, u0.dtype)
+    tight = BiCGStab(jnp.minimum(rtol, finest), 0.0, 1000) if solver is None else solver
     start = fixed.residual(jax.lax.stop_gradient(u0))
     size = jnp.linalg.norm(start)
     source = jnp.linalg.norm(jnp.broadcast_to(fixed.rhs, u0.shape))
@@ -216,8 +229,8 @@ def _solve(problem, u0, layout, preconditioner, solver, rtol, atol, max_steps, t
         u = eqx.error_if(
             u,
             result != optx.RESULTS.successful,
-            f"js.solve_nonlinear did not reach rtol = {rtol}, atol = {atol} in {max_steps} steps; "
-            "with throw=False, `result` says why and `stats` what was reached",
+            "js.solve_nonlinear did not reach its tolerance within max_steps; with throw=False, "
+            "`result` says why and `stats` what was reached",
         )
     stats = {
         "num_steps": state.steps,
@@ -234,6 +247,17 @@ def _constant(tree):
 
 def _shifted(operator, term):
     return operator.shifted(term) if isinstance(operator, Stencil) else _Sum(operator, term)
+
+
+class _Slope(eqx.Module):
+    """The derivative of a reaction at u, as a linear map."""
+
+    reaction: Reaction
+    args: Any
+    u: Array
+
+    def __call__(self, tangent):
+        return jax.jvp(lambda u: self.reaction(u, self.args), (self.u,), (tangent,))[1]
 
 
 class _Sum(AbstractOperator):

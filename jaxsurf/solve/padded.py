@@ -1,8 +1,14 @@
-"""Sparse matrices as padded arrays, slots first, with gathers in both directions."""
+"""Sparse matrices as padded arrays, slots first, with gathers in both directions.
+
+Sizes are rounded up to a few: a program compiled for one matrix then serves another that is
+about as wide, as the operators of different surfaces of as many points are.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+import math
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,6 +23,10 @@ from ..stencils.stencil import AbstractOperator, Composition, Stencil
 
 # An entry added by a scatter costs about as much as this many padded slots.
 _SCATTER = 12
+# Room in the list of entries beyond the slots: this share of the rows, or 4, 16, ... times that.
+_LISTED = 1 / 8
+# Widths tried for a matrix of known usual width: that times powers of this.
+_STEP = 0.7
 # Below this many entries everything is gathered at once, without a loop over slots.
 _SMALL = 50_000
 
@@ -27,7 +37,8 @@ class Table(NamedTuple):
     Args:
         columns: column of row i in slot s, `(k, m)`; padding refers to column 0.
         source: number of the entry, `(k, m)`; in padding a number past the end.
-        rows, others, sources: row, column and number of the entries beyond the k-th of their row.
+        rows, others, sources: row, column and number of the entries beyond the k-th of their row;
+            filled up with entries past the end.
     """
 
     columns: Any
@@ -37,31 +48,76 @@ class Table(NamedTuple):
     sources: Any
 
 
-def tabulate(indptr: np.ndarray, columns: np.ndarray, source: np.ndarray | None = None) -> Table:
-    """Slots for the rows of a matrix in compressed form; k is chosen by the cost of applying."""
+def tabulate(
+    indptr: np.ndarray,
+    columns: np.ndarray,
+    source: np.ndarray | None = None,
+    *,
+    rows: int | None = None,
+    width: float | None = None,
+) -> Table:
+    """Slots for the rows of a matrix in compressed form.
+
+    Args:
+        indptr, columns: of the matrix.
+        source: numbers to put in place of those of the entries.
+        rows: number of rows, empty ones at the end counted; those of the matrix if None.
+        width: about the length of the longest rows, if known.
+    """
     start, length = indptr[:-1].astype(np.int32), np.diff(indptr).astype(np.int32)
-    m, count = len(length), len(columns)
-    widest = int(length.max(initial=0))
-    # Number of entries beyond the k-th of their row, for every k.
-    longer = m - np.cumsum(np.bincount(length, minlength=widest + 1))
-    overflow = np.append(np.cumsum(longer[::-1])[::-1], 0)[: widest + 1]
-    k = int(np.argmin(np.arange(widest + 1) * m + _SCATTER * overflow))
+    count, m = len(columns), max(len(length), rows or 0)
+    k, listed = _slots(length, m, width)
     table, numbers = np.zeros((k, m), np.int32), np.full((k, m), count, np.int32)
-    for slot in range(k):
-        place = start + np.int32(slot)
-        rows = slice(None) if slot < length.min() else np.flatnonzero(length > slot)
-        table[slot, rows] = columns[place[rows]]
-        numbers[slot, rows] = place[rows]
+    # By the transposes: a row at a time, entries where they stand in memory.
+    filled = np.arange(k, dtype=np.int32) < length[:, None]
+    place = (start[:, None] + np.arange(k, dtype=np.int32))[filled]
+    slot = np.zeros((len(length), k), np.int32)
+    slot[filled] = columns[place]
+    table[:, : len(length)] = slot.T
+    slot[filled], slot[~filled] = place, count
+    numbers[:, : len(length)] = slot.T
+
     long = np.flatnonzero(length > k)
-    beyond = length[long] - k
-    rows = np.repeat(long, beyond).astype(np.int32)
-    step = np.arange(beyond.sum()) - np.repeat(np.cumsum(beyond) - beyond, beyond)
-    place = (start[rows] + k + step).astype(np.int32)
-    others = columns[place].astype(np.int32)
+    over = length[long] - k
+    owner = np.repeat(long, over)
+    step = np.arange(len(owner)) - np.repeat(np.cumsum(over) - over, over)
+    beyond = start[owner] + k + step
+    padded = lambda a, fill: np.append(a, np.full(listed - len(a), fill)).astype(np.int32)
+    others, sources = padded(columns[beyond], 0), padded(beyond, count)
     if source is not None:
         source = np.append(source, np.iinfo(np.int32).max).astype(np.int32)
-        numbers, place = source[numbers], source[place]
-    return Table(table, numbers, rows, others, place)
+        numbers, sources = source[numbers], source[sources]
+    return Table(table, numbers, padded(owner, 0), others, sources)
+
+
+def _slots(length: np.ndarray, m: int, width: float | None) -> tuple[int, int]:
+    """Number of slots and room in the list, of the few that there are, by the cost of applying."""
+    widest = int(length.max(initial=0))
+    # Number of entries beyond the k-th of their row, for every k.
+    longer = len(length) - np.cumsum(np.bincount(length, minlength=widest + 1))
+    overflow = np.append(np.cumsum(longer[::-1])[::-1], 0)
+    best = math.inf, 0, 0
+    for k in _widths(width):
+        over = int(overflow[min(k, widest + 1)])
+        listed = max(math.ceil(m * _LISTED), 1)
+        while listed < over:
+            listed *= 4
+        best = min(best, (k * m + _SCATTER * listed, k, listed))
+        if over == 0:
+            return best[1:]
+    raise AssertionError("the widths have no end")
+
+
+def _widths(width: float | None) -> Iterator[int]:
+    """Numbers of slots: powers of two times 5/4 and 7/4, or those around a usual width."""
+    if width is None:
+        yield 1
+        for power in itertools.count(2):
+            yield 2**power * 5 // 4
+            yield 2**power * 7 // 4
+    else:
+        for power in itertools.count(-math.ceil(math.log(max(width, 1)) / -math.log(_STEP))):
+            yield math.ceil(width * _STEP**-power)
 
 
 class PaddedMatrix(eqx.Module):
@@ -71,7 +127,7 @@ class PaddedMatrix(eqx.Module):
         indices: columns, `(k, m)`.
         weights: entries, `(k, m)`; zero in padded slots.
         diagonal: added to the diagonal, `(m,)`; None for zero.
-        extra: rows, columns and values of entries that did not fit.
+        extra: rows, columns and values of entries that did not fit; zeros fill the list up.
     """
 
     indices: Int[Array, "k m"]
@@ -80,20 +136,14 @@ class PaddedMatrix(eqx.Module):
     extra: tuple[Int[Array, " e"], Int[Array, " e"], Float[Array, " e"]]
 
     @classmethod
-    def from_scipy(cls, matrix: scipy.sparse.csr_matrix, dtype) -> PaddedMatrix:
-        table = tabulate(matrix.indptr, matrix.indices)
-        return cls.gathered(table, np.append(matrix.data.astype(dtype), np.zeros(1, dtype)))
-
-    @classmethod
-    def gathered(cls, table: Table, values, diagonal=None) -> PaddedMatrix:
-        """With the entries taken from an array whose last value is zero."""
-        extra = (
-            jnp.asarray(table.rows),
-            jnp.asarray(table.others),
-            jnp.asarray(values[table.sources]),
-        )
-        weights = jnp.asarray(values[table.source])
-        return cls(jnp.asarray(table.columns), weights, diagonal, extra)
+    def from_scipy(
+        cls, matrix: scipy.sparse.csr_matrix, dtype, *, rows=None, width=None
+    ) -> PaddedMatrix:
+        """Its rows in slots; `rows` and `width` as for `tabulate`."""
+        table = tabulate(matrix.indptr, matrix.indices, rows=rows, width=width)
+        values = np.append(matrix.data.astype(dtype), np.zeros(1, dtype))
+        extra = (table.rows, table.others, values[table.sources])
+        return cls(*jax.device_put((table.columns, values[table.source], None, extra)))
 
     def minus(self, factor, other: PaddedMatrix) -> PaddedMatrix:
         """This matrix less a number times another of the same layout."""
@@ -112,9 +162,7 @@ class PaddedMatrix(eqx.Module):
             add = lambda total, slot: (total + slot[0] * take(slot[1]), None)
             total = jax.lax.scan(add, start, (self.weights, self.indices))[0]
         rows, columns, values = self.extra
-        if rows.size:
-            total = total.at[rows].add(values * take(columns))
-        return total
+        return total.at[rows].add(values * take(columns))
 
 
 class Incoming(eqx.Module):
@@ -141,8 +189,9 @@ class Incoming(eqx.Module):
         indptr = np.append(0, np.cumsum(other.sum(axis=1)))
         matrix = scipy.sparse.csr_matrix((number[other], target[other], indptr), shape=(n, n))
         turned = matrix.tocsc()
-        table = tabulate(turned.indptr, turned.indices, turned.data)
-        return cls(stencil.indices, Table(*(jnp.asarray(a) for a in table)))
+        # A point is read about as often as it reads.
+        table = tabulate(turned.indptr, turned.indices, turned.data, width=1.15 * k)
+        return cls(stencil.indices, jax.device_put(table))
 
     def belongs_to(self, stencil: Stencil) -> bool:
         """Whether it was made for these indices; concrete."""

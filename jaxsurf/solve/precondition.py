@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float
 
-from ..arguments import is_concrete
+from ..arguments import instance, is_concrete
 from ..boundary import Closure
 from ..stencils.stencil import AbstractOperator, Composition, Stencil, check_scalar
 from .padded import Layout, PaddedMatrix, incoming_layout
@@ -19,6 +19,10 @@ from .reduced import annihilates_constants, reduced_matrix
 
 # The coarsest system has at most this many unknowns and is solved by a dense inverse.
 _COARSEST = 400
+# Room on the next level: one unknown for so many; a tenth to a twentieth are used as a rule.
+_COARSENING = 8
+# Share of a stencil's slots that lie within its support, at most.
+USED = 0.85
 # A connection counts as strong from this share of the geometric mean of both diagonal entries.
 _STRENGTH = 0.05
 # The smoother damps the part of the spectrum from this share of its end upwards.
@@ -50,6 +54,13 @@ class AbstractPreconditioner(eqx.Module):
         """The exact transpose, which serves the transposed operator."""
 
 
+def without_layout(preconditioner: AbstractPreconditioner) -> AbstractPreconditioner:
+    """The same, to be applied only: the layout of adjoint solves goes another way."""
+    return eqx.tree_at(
+        lambda p: p.incoming, preconditioner, None, is_leaf=lambda x: x is preconditioner.incoming
+    )
+
+
 class Jacobi(AbstractPreconditioner):
     """Division by the diagonal. Needs no set-up, and works on traced operators.
 
@@ -73,7 +84,7 @@ class Jacobi(AbstractPreconditioner):
 
 
 class Level(eqx.Module):
-    """One level of a multigrid hierarchy.
+    """One level of a multigrid hierarchy, filled up with unknowns that stay zero.
 
     Args:
         matrix: the operator on this level.
@@ -90,6 +101,10 @@ class Level(eqx.Module):
     restrict: PaddedMatrix
     prolong: PaddedMatrix
     damping: tuple[Float[Array, ""], ...]
+
+    @property
+    def n(self) -> int:
+        return self.inverse.shape[0]
 
     def smooth(self, x, b):
         for factor in self.damping:
@@ -119,6 +134,16 @@ class Multigrid(AbstractPreconditioner):
 
     levels: tuple[Level, ...]
     coarsest: Float[Array, "m m"]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Room on every level, from fine to coarse: what it is padded to."""
+        return (*(level.n for level in self.levels), len(self.coarsest))
+
+    def __repr__(self):
+        sizes = " > ".join(map(str, self.sizes))
+        where = ", singular: constants" if self.mean_zero else ""
+        return f"Multigrid({sizes} unknowns, {self.coarsest.dtype.name}{where})"
 
     def __call__(self, r):
         # The cycle is linear, so that a residual of any size can be brought to size one,
@@ -185,9 +210,9 @@ def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> 
         >>> bool((js.jacobi(screened).diagonal > 0).all())
         True
     """
+    _check_kinds(operator, conditions)
     if not isinstance(operator, Stencil):
         raise ValueError(f"the diagonal of a {type(operator).__name__} is not at hand")
-    check_scalar(operator)
     diagonal = operator.diagonal
     if conditions is not None:
         diagonal = jnp.where(conditions.bound, 1, diagonal)
@@ -230,34 +255,69 @@ def multigrid(
         >>> len(js.multigrid(laplacian).levels)
         1
     """
-    if isinstance(operator, Composition) and conditions is None:
-        outer, inner = (multigrid(o, single=single) for o in (operator.outer, operator.inner))
-        return _Product.of(outer, inner)
+    _check_kinds(operator, conditions)
+    return hierarchy(operator, conditions, single=single)
+
+
+def _check_kinds(operator, conditions) -> None:
+    instance(operator, AbstractOperator, "operator", "js.laplace_beltrami(cloud) makes one")
     check_scalar(operator)
+    if conditions is not None:
+        hint = "js.close(cloud, conditions) makes one of conditions"
+        instance(conditions, Closure, "conditions", hint)
+
+
+def hierarchy(operator, conditions, *, single: bool = True, layout: bool = True):
+    """`multigrid`, with or without the layout for adjoint solves."""
+    if isinstance(operator, Composition) and conditions is None:
+        outer, inner = (
+            hierarchy(o, None, single=single, layout=layout)
+            for o in (operator.outer, operator.inner)
+        )
+        return _Product.of(outer, inner)
     matrix = reduced_matrix(operator, conditions)
     mean_zero = annihilates_constants(matrix, conditions)
     dtype = np.dtype(np.float32) if single else matrix.dtype
+    width = USED * operator.k if isinstance(operator, Stencil) else None
     levels = []
     constant = np.ones(matrix.shape[0])
     if conditions is not None:
         constant[np.asarray(conditions.rows)] = 0
-    fine = matrix
-    while fine.shape[0] > _COARSEST:
+    fine, room = matrix, matrix.shape[0]
+    while room > _COARSEST:
         found = aggregate(fine, constant)
         if found is None:
             break
         tentative, constant = found
-        level, fine = _level(fine, tentative, dtype)
+        coarse = room_for(tentative.shape[1], room)
+        level, fine = _level(fine, tentative, dtype, room, coarse, width)
         levels.append(level)
+        room, width = coarse, None
     if fine.shape[0] > 4 * _COARSEST:
         raise ValueError(
             f"coarsening stopped at {fine.shape[0]} unknowns: too few strong connections"
         )
-    coarsest = jnp.asarray(_inverse(fine, constant if mean_zero else None).astype(dtype))
-    return Multigrid(incoming_layout(operator), mean_zero, tuple(levels), coarsest)
+    coarsest = np.zeros((room, room), dtype)
+    part = slice(fine.shape[0])
+    coarsest[part, part] = _inverse(fine, constant if mean_zero else None)
+    incoming = incoming_layout(operator) if layout else None
+    return Multigrid(incoming, mean_zero, tuple(levels), jnp.asarray(coarsest))
 
 
 # --- set-up on the host --------------------------------------------------------------------
+
+
+def room_for(unknowns: int, finer: int) -> int:
+    """What a level is padded to: a share of the room on the finer one, so that few sizes occur."""
+    room = -(-finer // _COARSENING)
+    while room < unknowns:
+        room *= 2
+    return room
+
+
+def filled(a: np.ndarray, room: int, value: float = 0.0) -> Array:
+    """The array with values appended."""
+    return jnp.asarray(np.append(a, np.full(room - len(a), value, a.dtype)))
 
 
 def aggregate(matrix, constant):
@@ -278,7 +338,7 @@ def aggregate(matrix, constant):
     return scipy.sparse.csr_matrix(tentative), coarse[:, 0]
 
 
-def _level(matrix, tentative, dtype):
+def _level(matrix, tentative, dtype, room: int, coarse: int, width):
     """A level, and the operator on the next one."""
     diagonal = matrix.diagonal()
     if np.any(diagonal == 0):
@@ -288,16 +348,26 @@ def _level(matrix, tentative, dtype):
     radius = jacobi_radius(matrix, inverse)
     prolong = smoothed(matrix, tentative, inverse, radius)
     restrict = prolong.T.tocsr()
-    pad = lambda a: PaddedMatrix.from_scipy(a, dtype)
+    pad = lambda a, rows, width: PaddedMatrix.from_scipy(a, dtype, rows=rows, width=width)
+    padded = pad(matrix, room, width)
     level = Level(
-        pad(matrix),
-        pad(matrix.T.tocsr()),
-        jnp.asarray(inverse.astype(dtype)),
-        pad(restrict),
-        pad(prolong),
-        chebyshev(radius, dtype),
+        padded,
+        pad(matrix.T.tocsr(), room, width),
+        filled(inverse.astype(dtype), room),
+        *transfers(padded, restrict, prolong, coarse),
+        tuple(jnp.asarray(x, dtype) for x in chebyshev(radius)),
     )
     return level, (restrict @ (matrix @ prolong)).tocsr()
+
+
+def transfers(padded, restrict, prolong, coarse: int) -> tuple[PaddedMatrix, PaddedMatrix]:
+    """Restriction and prolongation next to a level's matrix, as padded arrays."""
+    # About as wide as they are on surfaces.
+    (k, rows), dtype = padded.indices.shape, padded.weights.dtype
+    return (
+        PaddedMatrix.from_scipy(restrict, dtype, rows=coarse, width=2.2 * k + 12),
+        PaddedMatrix.from_scipy(prolong, dtype, rows=rows, width=0.16 * k + 2),
+    )
 
 
 def divisor(matrix) -> np.ndarray:
@@ -330,11 +400,11 @@ def jacobi_radius(matrix, inverse, steps: int = 8) -> float:
     return float(size)
 
 
-def chebyshev(radius, dtype, degree: int = 2) -> tuple[Float[Array, ""], ...]:
+def chebyshev(radius, degree: int = 2) -> tuple:
     """Step sizes at the roots of the Chebyshev polynomial on the upper part of the spectrum."""
     low, high = _SMOOTHED * radius, 1.1 * radius
     roots = np.cos(np.pi * (np.arange(degree) + 0.5) / degree)
-    return tuple(jnp.asarray(x, dtype) for x in 1 / ((low + high) / 2 + (high - low) / 2 * roots))
+    return tuple(1 / ((low + high) / 2 + (high - low) / 2 * roots))
 
 
 def _inverse(matrix, constant) -> np.ndarray:

@@ -9,16 +9,20 @@ import scipy.sparse
 from jaxtyping import Array, ArrayLike, Float
 
 from ..boundary import Closure
-from ..stencils.stencil import AbstractOperator, check_scalar
+from ..stencils.stencil import AbstractOperator, Stencil, check_scalar
 from .padded import PaddedMatrix
 from .precondition import (
+    USED,
     Level,
     Multigrid,
     aggregate,
     chebyshev,
     divisor,
+    filled,
     jacobi_radius,
+    room_for,
     smoothed,
+    transfers,
 )
 from .reduced import free_matrix
 
@@ -45,7 +49,7 @@ class _Pair(eqx.Module):
     stiff_diagonal: Float[Array, " m"]
     restrict: PaddedMatrix
     prolong: PaddedMatrix
-    radius: float = eqx.field(static=True)
+    radius: Float[Array, ""]
 
     def at(self, g) -> Level:
         inverse = 1 / (self.mass_diagonal - g * self.stiff_diagonal)
@@ -55,7 +59,7 @@ class _Pair(eqx.Module):
             inverse,
             self.restrict,
             self.prolong,
-            chebyshev(self.radius, inverse.dtype),
+            chebyshev(self.radius),
         )
 
 
@@ -101,19 +105,31 @@ def shifted_multigrid(
     stiff = free_matrix(operator, conditions)
     mass = scipy.sparse.identity(stiff.shape[0], stiff.dtype, format="csr")
     constant = np.ones(stiff.shape[0])
+    width = USED * operator.k if isinstance(operator, Stencil) else None
+    room = stiff.shape[0]
     pairs = []
-    while stiff.shape[0] > _COARSEST:
+    while room > _COARSEST:
         found = aggregate(stiff, constant)
         if found is None:
             break
         tentative, constant = found
-        pair, mass, stiff = _pair(mass, stiff, tentative)
+        coarse = room_for(tentative.shape[1], room)
+        pair, mass, stiff = _pair(mass, stiff, tentative, room, coarse, width)
         pairs.append(pair)
-    dense = lambda a: jnp.asarray(a.toarray().astype(np.float32))
-    return ShiftedMultigrid(tuple(pairs), dense(mass), dense(stiff))
+        room, width = coarse, None
+    # The unknowns that fill it up have the equation x = 0.
+    mass, stiff = _dense(mass, room, 1), _dense(stiff, room, 0)
+    return ShiftedMultigrid(tuple(pairs), jnp.asarray(mass), jnp.asarray(stiff))
 
 
-def _pair(mass, stiff, tentative):
+def _dense(matrix, room: int, diagonal: float) -> np.ndarray:
+    dense = np.diag(np.full(room, diagonal, np.float32))
+    size = matrix.shape[0]
+    dense[:size, :size] = matrix.toarray()
+    return dense
+
+
+def _pair(mass, stiff, tentative, room: int, coarse: int, width):
     """A level, and M and A on the next one."""
     below, beside = divisor(stiff), divisor(mass)
     inverse = np.divide(1, below, out=np.zeros_like(below), where=below != 0)
@@ -122,12 +138,18 @@ def _pair(mass, stiff, tentative):
     restrict = prolong.T.tocsr()
     # In one complex matrix both get one layout.
     both = (mass + 1j * stiff).tocsr()
-    pad = lambda a: PaddedMatrix.from_scipy(a.tocsr(), np.dtype(np.float32))
+    single = np.dtype(np.float32)
+    pad = lambda a: PaddedMatrix.from_scipy(a.tocsr(), single, rows=room, width=width)
     turned = both.T.tocsr()
-    vector = lambda a: jnp.asarray(a.astype(np.float32))
+    padded = pad(both.real)
     pair = _Pair(
-        pad(both.real), pad(both.imag), pad(turned.real), pad(turned.imag),
-        vector(beside), vector(below), pad(restrict), pad(prolong),
-        max(radius, jacobi_radius(mass, 1 / beside)),
-    )  # fmt: skip
+        padded,
+        pad(both.imag),
+        pad(turned.real),
+        pad(turned.imag),
+        filled(beside.astype(single), room, 1),
+        filled(below.astype(single), room),
+        *transfers(padded, restrict, prolong, coarse),
+        jnp.asarray(max(radius, jacobi_radius(mass, 1 / beside)), single),
+    )
     return pair, (restrict @ (mass @ prolong)).tocsr(), (restrict @ (stiff @ prolong)).tocsr()

@@ -11,8 +11,9 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..boundary import Closure
-from ..stencils.stencil import AbstractOperator
+from ..arguments import instance, real
+from ..boundary import Closure, check_border
+from ..stencils.stencil import AbstractOperator, Composition, Stencil, check_scalar
 from .padded import Layout, adjoint
 from .precondition import AbstractPreconditioner
 
@@ -43,6 +44,52 @@ def matrix_free(kind):
     ):
         has_property.register(kind, lambda operator: False)
     return kind
+
+
+class Linearised(AbstractOperator):
+    """An operator plus a linear map of which only products are known.
+
+    Args:
+        operator: L.
+        slope: the derivative of a reaction.
+    """
+
+    operator: AbstractOperator
+    slope: Callable
+    in_shape = ()
+    out_shape = ()
+
+    @property
+    def n(self):
+        return self.operator.n
+
+    def __call__(self, u):
+        return self.operator(u) + self.slope(u)
+
+    def transpose(self):
+        raise NotImplementedError("see `_adjoint`")
+
+    def to_scipy(self):
+        raise NotImplementedError("the matrix of a derivative is not at hand")
+
+
+class _Turned(eqx.Module):
+    """The transpose of a linearised operator; with the plain one's, where that is known."""
+
+    operator: Linearised
+    plain: Callable | None
+
+    def __call__(self, v):
+        turned = lambda f: jax.linear_transpose(f, v)(v)[0]
+        plain = turned(self.operator.operator) if self.plain is None else self.plain(v)
+        return plain + turned(self.operator.slope)
+
+
+def _adjoint(operator, layout) -> Callable | None:
+    """The transposed operator; None where a layout is lacking."""
+    if isinstance(operator, Linearised):
+        return _Turned(operator, adjoint(operator.operator, layout))
+    return adjoint(operator, layout)
 
 
 @matrix_free
@@ -82,6 +129,22 @@ class System(Square):
         u = vector if self.conditions is None else self.conditions.homogeneous(vector)
         return self.free(self.operator(u)) + self.rest(vector)
 
+    def products(self, fields: Float[Array, "n c"]) -> Float[Array, "n c"]:
+        """P A E of several fields at once."""
+        if self.conditions is None:
+            return self.operator(fields)
+        return self.conditions.restrict(self.operator(self.conditions.homogeneous(fields)))
+
+    def spread(self) -> Float[Array, "*n"]:
+        """One over half the row sums of moduli: the square of a distance for a Laplacian."""
+        outer = self.operator
+        while isinstance(outer, Composition):
+            outer = outer.outer
+        if not isinstance(outer, Stencil):
+            return 1 / jnp.abs(jnp.asarray(self.sigma if self.sigma is not None else 1))
+        half = jnp.sum(jnp.abs(outer.weights), axis=0) / 2
+        return 1 / jnp.where(half > 0, half, 1)
+
     def rest(self, v):
         """What is added to P A E."""
         return v - self.free(v) + self.constant(self.shift(v))
@@ -104,7 +167,7 @@ class System(Square):
         return jnp.zeros((), self.dtype) if self.sigma is None else -self.sigma * self.mean(v)
 
     def transpose(self):
-        return Transposed(self, adjoint(self.operator, self.layout))
+        return Transposed(self, _adjoint(self.operator, self.layout))
 
     def in_structure(self):
         return jax.ShapeDtypeStruct((self.operator.n,), self.dtype)
@@ -133,6 +196,31 @@ class Transposed(Square):
 
     def in_structure(self):
         return self.system.in_structure()
+
+
+def check_system(operator, conditions, preconditioner, solver, atol) -> None:
+    """Refuse what is not of the kinds that a problem consists of."""
+    instance(operator, AbstractOperator, "operator", "js.laplace_beltrami(cloud) makes one")
+    check_scalar(operator)
+    if conditions is not None:
+        hint = "js.close(cloud, conditions) makes one of conditions"
+        instance(conditions, Closure, "conditions", hint)
+        if conditions.n != operator.n:
+            raise ValueError(f"conditions for {conditions.n} points, the operator has {operator.n}")
+    if preconditioner is not None:
+        hint = "js.multigrid(operator) makes one"
+        instance(preconditioner, AbstractPreconditioner, "preconditioner", hint)
+    if solver is not None:
+        instance(solver, lx.AbstractLinearSolver, "solver", "js.BiCGStab() is one")
+    real(atol, "atol", least=0)
+    check_border(operator, conditions)
+
+
+def tolerance(rtol, dtype) -> float:
+    """A relative tolerance, by the precision if it is None."""
+    if rtol is None:
+        return 1e-8 if jnp.finfo(dtype).eps < 1e-12 else 1e-4
+    return float(real(rtol, "rtol", above=0, below=1))
 
 
 @matrix_free

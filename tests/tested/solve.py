@@ -5,7 +5,9 @@ _RESULT = "(made by eigenmodes)"
 TESTED = {
     "solve": {
         "value": "test_steady.py::test_poisson_on_the_closed_sphere_converges, "
-        "test_steady.py::test_screened_anisotropic_and_helmholtz",
+        "test_steady.py::test_screened_anisotropic_and_helmholtz, "
+        "test_steady.py::test_what_is_incompatible_is_an_error, "
+        "test_steady.py::test_numbers_of_any_size",
         "gradient": {
             "weights": "test_steady.py::test_derivatives_in_weights_and_right_hand_side",
             "rhs": "test_steady.py::test_derivatives_in_weights_and_right_hand_side",
@@ -19,7 +21,10 @@ TESTED = {
     },
     "solve_nonlinear": {
         "value": "test_newton.py::test_known_solution_in_few_steps",
-        "gradient": {"all": "test_newton.py::test_derivatives"},
+        "gradient": {
+            "weights, args, rhs": "test_newton.py::test_derivatives",
+            "coupled reaction": "test_newton.py::test_a_reaction_that_couples_points",
+        },
         "jit": "test_newton.py::test_derivatives",
         "vmap": None,
         "float32": None,

@@ -268,8 +268,11 @@ def test_a_users_own_method():
     operator = js.laplace_beltrami(CLOUD, method=NearestPair())
     assert jnp.abs(operator(jnp.ones(N))).max() < 1e-10
     z = CLOUD.points[:, 2]
-    assert relative_error(operator(z), -2 * z) < 0.5  # 4 / r² averages to the Laplacian
     mask = js.find_neighbors(CLOUD, k=7)
+    others = np.asarray(mask.indices)[:, 1:]
+    r2 = np.sum((np.asarray(CLOUD.points)[others] - np.asarray(CLOUD.points)[:, None]) ** 2, axis=2)
+    by_hand = np.mean(4 * (np.asarray(z)[others] - np.asarray(z)[:, None]) / r2, axis=1)
+    np.testing.assert_allclose(operator(z), by_hand, rtol=1e-9, atol=1e-9)
     slope = jax.grad(
         lambda s: js.laplace_beltrami(
             js.PointCloud(s * CLOUD.points, CLOUD.normals), mask, method=NearestPair()
@@ -302,7 +305,7 @@ def test_round_off_of_the_input_does_not_matter():
 def test_a_transpose_is_shifted_at_its_own_points():
     """Slot 0 of a transpose need not be the point itself; a row may lack its own point."""
     operator = js.laplace_beltrami(CLOUD, LISTS, method=METHOD).transpose()
-    assert bool(jnp.any(operator.indices[0] != jnp.arange(N)))
+    operator = js.Stencil(operator.indices[::-1], operator.weights[::-1])
     np.testing.assert_allclose(operator.shifted(3.0)(U), operator(U) + 3 * U, atol=1e-9)
     ring = js.Stencil((jnp.arange(5)[None] + 1) % 5, jnp.ones((1, 5)))
     u = jnp.arange(5.0)

@@ -10,7 +10,7 @@ import scipy.linalg
 
 import jaxsurf as js
 
-from .helpers import jittered_sphere, relative_error, ring
+from .helpers import check_derivative, jittered_sphere, relative_error, ring
 
 CLOUD = js.sphere(600)
 METHOD = js.DCPSE(order=4)
@@ -372,6 +372,20 @@ def test_upwinding_takes_the_neighbours_given_also_under_jit():
     near = js.choose_neighbors(cloud)
     moved = jax.jit(lambda p, v: js.upwinding(js.PointCloud(p, p), v, neighbors=near).weights)
     np.testing.assert_allclose(moved(cloud.points, TURN), make(TURN, near), rtol=1e-8, atol=1e-8)
+
+
+def test_upwinding_is_differentiable():
+    """In the velocity and in the points, that come with normals of their own."""
+    cloud = js.sphere(100)
+    near = js.choose_neighbors(cloud)
+    u, turn = jnp.sin(3 * cloud.points[:, 0]), jnp.cross(jnp.ones(3), cloud.points)
+
+    def damped(points, velocity):
+        made = js.PointCloud(points, cloud.normals)
+        return jnp.sum(js.upwinding(made, velocity, neighbors=near)(u) ** 2)
+
+    check_derivative(lambda v: damped(cloud.points, v), turn)
+    check_derivative(lambda p: damped(p, turn), cloud.points, rtol=1e-5)
 
 
 SINGLE = [js.RKC2(), js.IMEX(order=2), js.IMEX(order=3), js.SDIRK(order=3), dfx.Tsit5()]

@@ -77,7 +77,8 @@ TESTED: dict[str, dict[str, Entry]] = {
         "float32": None, "bad input": "malformed",
     },
     "step_preconditioner": {
-        "value": "test_shifted.py::test_steps_with_a_preconditioner", "gradient": None,
+        "value": "test_shifted.py::test_steps_and_gradients_are_the_same_with_it",
+        "gradient": "test_shifted.py::test_steps_and_gradients_are_the_same_with_it",
         "jit": None, "vmap": None, "float32": None, "bad input": "malformed",
     },
     "choose_solver": {
@@ -90,7 +91,10 @@ TESTED: dict[str, dict[str, Entry]] = {
     },
     "upwinding": {
         "value": f"{_PDE}::test_damping_moves_all_eigenvalues_of_advection_to_the_left",
-        "gradient": None,
+        "gradient": {
+            "velocity": f"{_PDE}::test_upwinding_is_differentiable",
+            "cloud": f"{_PDE}::test_upwinding_is_differentiable",
+        },
         "jit": f"{_PDE}::test_upwinding_takes_the_neighbours_given_also_under_jit",
         "vmap": None, "float32": None, "bad input": "malformed",
     },

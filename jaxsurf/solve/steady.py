@@ -239,11 +239,11 @@ def _raise_on_failure(solution, dtype, rtol, atol) -> None:
         )
     residual, round_off = stats["relative_residual"], stats["round_off"]
     after = f" after {stats['num_steps']} steps" if "num_steps" in stats else ""
-    why = "The system may be singular or indefinite, or a better preconditioner is needed"
+    why = "The system may be singular or indefinite, or need a better preconditioner"
     if max(rtol, 0.05 * residual) < round_off:
         why = (
-            f"The tolerance is below round-off: the rounding of the solution to {dtype} alone "
-            f"leaves {round_off:.1e}"
+            "The system may be singular or indefinite, or the tolerance is below round-off: the "
+            f"rounding of the solution to {dtype} alone leaves {round_off:.1e}"
         )
         if dtype == np.float32:
             why += '. In double precision, jax.config.update("jax_enable_x64", True), it is less'

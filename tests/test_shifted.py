@@ -69,7 +69,7 @@ def test_steps_and_gradients_are_the_same_with_it():
 
 
 def test_misuse():
-    with pytest.raises(ValueError, match="no preconditioner for the steps of WaveEquation"):
+    with pytest.raises(ValueError, match="no preconditioner for problem = WaveEquation"):
         js.step_preconditioner(js.WaveEquation(LAPLACIAN), Z)
     with pytest.raises(ValueError, match="concrete arrays"):
         jax.jit(lambda w: shifted_multigrid(js.Stencil(LAPLACIAN.indices, w)).mass)(

@@ -160,7 +160,8 @@ def instance(value: Any, kinds: type | tuple[type, ...], name: str, hint: str = 
         kinds = kinds if isinstance(kinds, tuple) else (kinds,)
         needed = " or ".join(kind.__name__.removeprefix("Abstract") for kind in kinds)
         more = f": {hint}" if hint else ""
-        raise TypeError(f"{name} is {_short(value)}, expected a {needed}{more}")
+        article = "an" if needed[0] in "AEIO" else "a"
+        raise TypeError(f"{name} is {_short(value)}, expected {article} {needed}{more}")
     return value
 
 

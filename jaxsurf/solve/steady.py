@@ -231,7 +231,7 @@ def _raise_on_failure(solution, dtype, rtol, atol) -> None:
     of = "" if failed.size == 1 else f" for right-hand side {i}"
     if np.ravel(np.asarray(solution.result == lx.RESULTS.singular))[i]:
         raise ValueError(
-            f"right-hand side {'' if failed.size == 1 else i} is incompatible: the operator "
+            f"right-hand side{'' if failed.size == 1 else f' {i}'} is incompatible: the operator "
             f"annihilates the constants, so that only a right-hand side of mean zero over the "
             f"surface has a solution. Its mean is {stats['incompatible']:.3g}, of which the "
             f"discretisation explains {stats['compatible_within']:.2g} at most. Subtract its "

@@ -531,7 +531,8 @@ def _along(gradient: Stencil, velocity, conservative: bool) -> Stencil:
     r"""$u \mapsto \nabla\cdot(v\,u)$ or $v\cdot\nabla u$ as one stencil."""
     v = _checked_velocity(velocity, gradient)
     v = jnp.moveaxis(v[gradient.indices], -1, 1) if conservative else v.T[None]
-    return Stencil(gradient.indices, jnp.sum(gradient.weights * v, axis=1))
+    weights = jnp.sum(gradient.weights * v, axis=1)
+    return Stencil(gradient.indices, weights, (), (), gradient.diagnostics, gradient.border)
 
 
 def _advected(gradient: Stencil, velocity, u: Field, conservative: bool) -> Field:

@@ -79,8 +79,8 @@ def solve(
         the rounding of u leaves), `incompatible` (λ) and `compatible_within` (what is allowed of
         it). An incompatible right-hand side has the result `singular`.
 
-    Accuracy: of the operator (`tests/test_steady.py`); in single precision errors of u are below
-    1e-3 for a screened problem on 1,000 points, and grow with the condition of A, like n.
+    Accuracy: of the operator (`tests/test_steady.py`); in single precision u is within 1e-3
+    of that in double on a sphere of 1,000 points, and rounding grows with the condition of A.
     Differentiable: forward and reverse, in the weights of the operator (hence the geometry), the
     conditions and the right-hand side, by the implicit function theorem: one more solve with A
     or its transpose, to the same tolerance. Under `jit` and `vmap` as without, also over weights.

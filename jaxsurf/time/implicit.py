@@ -302,8 +302,7 @@ _FORCING = 1e-2
 def _steps(tableau: Tableau, terms, solve, t0, t1, y0, args, rates, made_jump):
     """All stages of one step, for one term (implicit) or two (explicit, implicit).
 
-    A loop over stages, not one after the other in the program, which compiles several times as
-    fast.
+    A loop over stages, not one after the other in the program: it compiles faster.
 
     Args:
         solve: (t, r, start) -> y with y - γ Δt f(t, y) = r, and its result code.

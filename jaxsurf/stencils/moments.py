@@ -93,12 +93,16 @@ def _moment_solve_jvp(low, high, primals, tangents):
 
 @functools.cache
 def _gather_table(dim: int, low: int, high: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where the moment of multi-index beta + gamma stands: first coordinates, last coordinate."""
+    """Where the moment of multi-index beta + gamma stands: first coordinates, last coordinate.
+
+    Of 32 bits: arrays of 64 that live on keep in JAX the type of their first use, and then fail
+    after `enable_x64` has changed.
+    """
     basis = multi_indices(dim, low, high)
     total = basis[:, None] + basis[None]
     place = position(dim - 1, 2 * high) if dim > 1 else {(): 0}
     rows = np.array([[place[tuple(g[:-1])] for g in row] for row in total.tolist()])
-    return rows, total[..., -1]
+    return rows.astype(np.int32), total[..., -1].astype(np.int32)
 
 
 def _gram(x, w, low, high):

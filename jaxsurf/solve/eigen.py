@@ -2,6 +2,7 @@ r"""Eigenmodes of an operator, computed on the host, with exact derivatives."""
 
 from __future__ import annotations
 
+import functools
 import math
 
 import equinox as eqx
@@ -125,7 +126,8 @@ class _System(eqx.Module):
     def of(operator: AbstractOperator, conditions: Closure | None) -> _System:
         if conditions is None:
             return _System(operator, jnp.ones(operator.n, bool))
-        return _System(operator @ conditions.stencil, ~conditions.bound)
+        stencil, free = _interior(conditions)
+        return _System(operator @ stencil, free)
 
     def __call__(self, fields: Float[Array, "n c"]) -> Float[Array, "n c"]:
         free = self.free[:, None]
@@ -135,6 +137,12 @@ class _System(eqx.Module):
         """The matrix of the free points, and which they are."""
         free = np.flatnonzero(np.asarray(self.free))
         return -self.operator.to_scipy().astype(float)[free][:, free], free
+
+
+@eqx.filter_jit
+def _interior(conditions: Closure):
+    """E, which fills in bound points, and where the free ones are: in one program."""
+    return conditions.stencil, ~conditions.bound
 
 
 # --- the rule -------------------------------------------------------------------------------
@@ -153,8 +161,14 @@ def _modes_jvp(primals, tangents):
     if not jax.tree.leaves(tangents[0]):
         return (values, functions, *rest), (None,) * 5
 
+    values_dot, functions_dot = _tangents(system, tangents[0], space, k)
+    return (values, functions, *rest), (values_dot, functions_dot, None, None, None)
+
+
+def _tangents(system: _System, system_dot: _System, space: Subspace, k: int):
+    """Of values and functions."""
     # The tangent of M V, with V held.
-    change = eqx.filter_jvp(lambda m: m(space.right), (system,), (tangents[0],))[1]
+    change = eqx.filter_jvp(lambda m: m(space.right), (system,), (system_dot,))[1]
     same = space.groups[:, None] == space.groups
     # Within a group: that of an eigenvalue is y^H dM x, with its left and right vectors.
     inner = jnp.where(same, space.left.T @ change, 0)
@@ -164,9 +178,8 @@ def _modes_jvp(primals, tangents):
     turn = _sylvester(system, space, jnp.where(wanted, space.right @ inner - change, 0))
     basis = lambda span: _basis(span, same, _reference(system, k))
     functions_dot = jax.jvp(basis, (space.right,), (turn,))[1][:, :k]
-    functions_dot = functions_dot * jnp.sqrt(jnp.sum(system.free).astype(functions.dtype))
-    tangent = (values_dot.astype(values.dtype), functions_dot, None, None, None)
-    return (values, functions, *rest), tangent
+    functions_dot = functions_dot * jnp.sqrt(jnp.sum(system.free).astype(functions_dot.dtype))
+    return values_dot.astype(space.values.dtype), functions_dot
 
 
 def _subspace(system: _System, k: int, degenerate: float, *, left: bool) -> Subspace:
@@ -202,11 +215,16 @@ def _reference(system: _System, k: int) -> Float[Array, "n K"]:
     """
     n = system.operator.n
     kinds = [a.dtype for a in jax.tree.leaves(eqx.filter(system, eqx.is_inexact_array))]
-    count = min(k + 8 + 2 * math.isqrt(k), n)
-    column = lambda j: jax.random.normal(jax.random.key(j), (n,), jnp.result_type(*kinds))
+    return _noise(n, min(k + 8 + 2 * math.isqrt(k), n), jnp.result_type(*kinds))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _noise(n: int, count: int, dtype) -> Float[Array, "n K"]:
+    column = lambda j: jax.random.normal(jax.random.key(j), (n,), dtype)
     return 1 + jax.vmap(column)(jnp.arange(count)).T
 
 
+@eqx.filter_jit
 def _results(system: _System, space: Subspace, k: int):
     functions = space.right[:, :k]
     residual = system(functions) - space.right @ space.block[:, :k]

@@ -36,8 +36,11 @@ TESTED = {
             "weights": "test_eigen.py::test_derivative_of_simple_values, "
             "test_eigen.py::test_derivative_of_simple_functions",
             "conditions": "test_eigen.py::test_derivative_in_the_conditions",
+            "points": "test_eigen.py::test_derivative_of_simple_values",
+            "normals": "test_solve_forms.py::test_gradient_of_values_in_normals",
         },
-        "jit": "test_eigen.py::test_under_jit_and_vmap",
+        "jit": "test_eigen.py::test_under_jit_and_vmap, "
+        "test_solve_forms.py::test_modes_of_another_operator_compile_nothing",
         "vmap": "test_eigen.py::test_under_jit_and_vmap",
         "float32": "test_eigen.py::test_single_precision",
         "bad input": "malformed",

@@ -253,7 +253,7 @@ class Stencil(AbstractOperator):
         if self.border is not None:
             data["border"] = np.asarray(self.border)
         with open(path, "wb") as file:
-            np.savez(file, allow_pickle=False, **data)
+            np.savez(file, **data)
 
     @classmethod
     def load(cls, path: str | Path) -> Stencil:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsurf as js
-from jaxsurf.time.implicit import _IMEX, _SDIRK
+from jaxsurf.time.implicit import _IMEX, _SDIRK, _relative
 
 from .helpers import ring
 
@@ -238,6 +238,18 @@ def test_a_jump_of_the_forcing_is_taken_note_of(solver):
     solution = js.integrate(one, 0 * X, t1=1.0, solver=solver, controller=controller)
     np.testing.assert_allclose(solution.ys[-1], 5.0, rtol=1e-8)
     assert int(solution.stats["num_rejected_steps"]) == 0
+
+
+@pytest.mark.parametrize("field", ["zero", "constant", "eigenvector"])
+def test_systems_with_a_simple_answer_are_solved(field):
+    """A multiple of the right-hand side solves them: BiCGStab alone divides zero by zero."""
+    right = dict(zero=0 * X, constant=1 + 0 * X, eigenvector=X)[field]
+    operator = lx.FunctionLinearOperator(
+        lambda u: u - 0.1 * LAPLACIAN(u), jax.eval_shape(lambda: X)
+    )
+    found = lx.linear_solve(operator, right, _relative(None, None, right), throw=False)
+    assert found.result == lx.RESULTS.successful
+    np.testing.assert_allclose(operator.mv(found.value), right, atol=1e-8)
 
 
 def test_derivatives_by_systems_that_are_not_solved_are_not_numbers():

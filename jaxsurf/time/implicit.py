@@ -373,13 +373,22 @@ class _Relative(lx.AbstractLinearSolver):
         return self.solver.init(operator, options), operator
 
     def compute(self, state, vector, options):
-        inner, operator = state
+        krylov, operator = state
         norm = root_mean_square(vector)
         scale = jnp.where(norm > 0, norm, 1)
         unit = jax.tree.map(lambda v: v / scale, vector)
-        x, result, stats = self.solver.compute(inner, unit, options)
-        residual = jax.tree.map(jnp.subtract, operator.mv(x), unit)
-        good = root_mean_square(residual) <= 10 * self.tolerance
+        x, result, stats = self.solver.compute(krylov, unit, options)
+        missed = lambda x: root_mean_square(jax.tree.map(jnp.subtract, operator.mv(x), unit))
+        # Where a multiple of the right-hand side solves the system (zero, constants, eigenvectors),
+        # BiCGStab divides zero by zero.
+        image = operator.mv(unit)
+        inner = lambda a, b: sum(jnp.vdot(*pair) for pair in zip(*map(jax.tree.leaves, (a, b))))
+        length = inner(image, image)
+        factor = inner(unit, image) / jnp.where(length > 0, length, 1)
+        multiple = jax.tree.map(lambda u: factor * u, unit)
+        simple = missed(multiple) <= self.tolerance
+        x = jax.tree.map(lambda x, u: jnp.where(simple, u, x), x, multiple)
+        good = missed(x) <= 10 * self.tolerance
         # Too many steps of this solver are not to be mistaken for too many steps in time.
         mild = (result == lx.RESULTS.successful) | (result == lx.RESULTS.max_steps_reached)
         result = lx.RESULTS.where(

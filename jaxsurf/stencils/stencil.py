@@ -253,7 +253,7 @@ class Stencil(AbstractOperator):
         if self.border is not None:
             data["border"] = np.asarray(self.border)
         with open(path, "wb") as file:
-            np.savez(file, **data)
+            np.savez(file, **data)  # type: ignore[arg-type]
 
     @classmethod
     def load(cls, path: str | Path) -> Stencil:

@@ -204,7 +204,7 @@ def _write(path: Path, key: str, now: _Progress) -> None:
     partial = path.with_name(path.name + ".part")
     with open(partial, "wb") as file:
         seal = np.array(_digest((key, leaves)))
-        np.savez(file, key=np.array(key), seal=seal, **data)
+        np.savez(file, key=np.array(key), seal=seal, **data)  # type: ignore[arg-type]
         file.flush()
         os.fsync(file.fileno())
     os.replace(partial, path)

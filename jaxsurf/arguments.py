@@ -37,13 +37,7 @@ def as_float(x: Any, name: str = "array") -> Float[Array, "..."]:
         TypeError: what is no array of real numbers: complex numbers, text, objects, ragged lists.
     """
     if not isinstance(x, jax.Array):
-        try:
-            given = np.asarray(x)
-        except ValueError as error:  # ragged
-            raise TypeError(f"{name} is no array of numbers: {error}") from None
-        if given.dtype.kind not in "fiub" and not jnp.issubdtype(given.dtype, jnp.floating):
-            raise TypeError(f"{name} is {_described(x, given)}, expected an array of real numbers")
-        x = jnp.asarray(given)
+        x = jnp.asarray(_real_numbers(x, name))
     if jnp.issubdtype(x.dtype, jnp.complexfloating):
         raise TypeError(f"{name} is complex ({x.dtype}), expected real numbers")
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
@@ -59,13 +53,7 @@ def on_host(x: Any, name: str = "array") -> np.ndarray:
         raise TypeError(f"{name} must be concrete: give it from outside jit, vmap and grad")
     if isinstance(x, jax.Array):
         x = np.asarray(as_float(x, name))
-    try:
-        given = np.asarray(x)
-    except ValueError as error:  # ragged
-        raise TypeError(f"{name} is no array of numbers: {error}") from None
-    if given.dtype.kind not in "fiub" and not jnp.issubdtype(given.dtype, jnp.floating):
-        raise TypeError(f"{name} is {_described(x, given)}, expected an array of real numbers")
-    return given.astype(float)
+    return _real_numbers(x, name).astype(float)
 
 
 def in_range(values: Any, name: str) -> Any:
@@ -255,6 +243,17 @@ def differentiable(f: Any, name: str, *arguments: jax.ShapeDtypeStruct) -> Any:
             f"{name} cannot be traced by JAX; write it with jax.numpy in place of NumPy, math and"
             f" conditions on values ({what})"
         ) from None
+
+
+def _real_numbers(x: Any, name: str) -> np.ndarray:
+    """What is given, as an array of NumPy."""
+    try:
+        given = np.asarray(x)
+    except ValueError as error:  # ragged
+        raise TypeError(f"{name} is no array of numbers: {error}") from None
+    if given.dtype.kind not in "fiub" and not jnp.issubdtype(given.dtype, jnp.floating):
+        raise TypeError(f"{name} is {_described(x, given)}, expected an array of real numbers")
+    return given
 
 
 def _short(value: Any) -> str:

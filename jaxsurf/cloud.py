@@ -96,7 +96,7 @@ class PointCloud(eqx.Module):
             size,
         )
         seen = points[on]
-        extent = float(np.ptp(seen, axis=0).max(initial=0))
+        extent = float(np.ptp(seen, axis=0).max()) if len(seen) else 0.0
         least = 1e4 * float(info.tiny) ** 0.5  # the spacing is a small part of the extent
         if 0 < extent < least:
             raise ValueError(

@@ -7,7 +7,7 @@ import pytest
 
 import jaxsurf as js
 
-from .helpers import check_derivative, jittered_sphere, relative_error
+from .helpers import check_derivative, count_compilations, jittered_sphere, relative_error
 
 # Minutes in all.
 pytestmark = pytest.mark.slow
@@ -93,6 +93,43 @@ def test_gradient_in_points_and_normals():
         return weight @ distance
 
     check_derivative(observed, jnp.stack([cloud.points, cloud.normals]), step=1e-4)
+
+
+def test_another_geometry_compiles_nothing():
+    method = js.GFDM(degree=2)
+
+    def measured(cloud, source):
+        neighbors = js.find_neighbors(cloud, method.neighbor_count(3))
+        js.laplace_beltrami(cloud, neighbors, method=method)
+        js.surface_gradient(cloud, neighbors, method=method)
+        with count_compilations() as names:
+            js.geodesic_distance(cloud, np.array([source]), neighbors=neighbors, method=method)
+        return names
+
+    names = measured(js.sphere(1_000), 125)
+    assert names.count("jit(_distances)") == 1 and len(names) < 12, names
+    assert not measured(js.ellipsoid(1_000, (1.0, 0.9, 0.8)), 800)
+
+
+def test_a_border():
+    """Straight ways in a square with marked border, about which nothing has to be said."""
+    cloud = js.graph(lambda x, y: 0 * x, (32, 32))
+    for source in (0, 500):
+        distance = js.geodesic_distance(cloud, np.array([source]))
+        exact = jnp.linalg.norm(cloud.points - cloud.points[source], axis=1)
+        assert relative_error(distance, exact) < 1e-2
+
+
+def test_single_precision():
+    """JAX's default; within 1e-4 of what double precision gives."""
+    cloud = js.sphere(1_000)
+    exact = np.asarray(js.geodesic_distance(cloud, np.array([125])))
+    points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+    with jax.enable_x64(False):
+        single = js.PointCloud(jnp.asarray(points), jnp.asarray(normals))
+        distance = js.geodesic_distance(single, np.array([125]))
+        assert distance.dtype == jnp.float32
+    assert relative_error(np.asarray(distance, float), exact) < 1e-4
 
 
 @pytest.mark.core

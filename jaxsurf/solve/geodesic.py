@@ -2,6 +2,7 @@ r"""Distances along a surface by the heat method."""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -10,18 +11,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
 
 from ..arguments import instance, is_concrete, real
-from ..boundary import close
 from ..build import choose_neighbors
 from ..cloud import PointCloud
-from ..conditions import dirichlet
 from ..neighbors import Neighbors
 from ..operators import laplace_beltrami, surface_gradient
 from ..stencils.gfdm import GFDM
 from ..stencils.method import AbstractMethod
 from ..stencils.stencil import Stencil
-from .precondition import multigrid
+from .precondition import AbstractPreconditioner, multigrid
 from .steady import solve
 
 
@@ -66,10 +67,10 @@ def geodesic_distance(
     more points: heat for a time of the size of h² is not resolved, whatever h. Where fronts meet
     first order: 7e-3 from five sources (`tests/test_geodesic.py`,
     `python -m experiments run geodesics`). Not yet shown for methods above second order.
+    In float32 within 1e-4 of that, in l2 (`test_single_precision` there).
     Differentiable: forward and reverse, in points and normals, for fixed neighbours.
     Raises:
-        ValueError: no source; a source that is no point; a point that no path leads to (on
-            concrete arrays).
+        ValueError: no source; a source that is no point; a point that no path leads to.
         RuntimeError: a linear solve failed.
         ImportError: pyamg is not installed (extra `multigrid`).
 
@@ -97,33 +98,42 @@ def geodesic_distance(
     else:
         rtol = float(jnp.finfo(cloud.points.dtype).eps) ** 0.6
 
+    indices, mask = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
+    path = _paths(jax.lax.stop_gradient(cloud.points), neighbors, indices, mask, sources)
+    near, owners = _around(indices, sources)
+    with jax.ensure_compile_time_eval():  # of the lists alone, also where points are traced
+        share = _shares(mask).astype(cloud.points.dtype)
+        preconditioner = _preconditioner(indices, share, near)
+        known = jax.device_put((share, near, owners, sources.astype(np.int32)))
     laplacian = laplace_beltrami(cloud, neighbors, method=method)
     gradient = surface_gradient(cloud, neighbors, method=method)
-    spacing = smoothing * _spacing(cloud, neighbors)
-    path = _path_length(jax.lax.stop_gradient(cloud.points), neighbors, sources)
-    if is_concrete(path) and not np.isfinite(path).all():
-        lost = np.flatnonzero(~np.isfinite(path))
-        raise ValueError(
-            f"no path along neighbours leads from the sources to point {lost[0]} "
-            f"({lost.size} such points)"
-        )
+    scale = np.asarray(smoothing, cloud.points.dtype)
+    plain = (laplacian.weights, gradient.weights)
+    return _distances(
+        cloud.points, cloud.normals, neighbors, plain, path, known, preconditioner, scale, rtol
+    )
 
-    def rescaled(operator: Stencil) -> Stencil:
-        """The operator on v: similar to that on u, whatever the path."""
-        growth = jnp.exp((path - path[operator.indices]) / spacing)
-        shape = (growth.shape[0], *[1] * len(operator.out_shape), cloud.n)
-        return eqx.tree_at(lambda s: s.weights, operator, operator.weights * growth.reshape(shape))
 
-    heat = rescaled(laplacian).scaled(-(spacing**2)).shifted(1.0)
-    start = jnp.zeros(cloud.n, cloud.points.dtype).at[sources].set(1)
+@eqx.filter_jit
+def _distances(points, normals, neighbors, plain, path, known, preconditioner, smoothing, rtol):
+    """All that is done on the device, in one program; rtol is static."""
+    share, near, owners, sources = known
+    indices = neighbors.indices.T
+    spacing = smoothing * _spacing(points, neighbors)
+    # The operators on v: similar to those on u, whatever the path.
+    growth = jnp.exp((path - path[indices]) / spacing)
+    laplacian, gradient = plain
+    heat = Stencil(indices, laplacian * growth).scaled(-(spacing**2)).shifted(1.0)
+    start = jnp.zeros_like(path).at[sources].set(1)
     v = _warm(heat, start, rtol)
-    flow = -rescaled(gradient)(v)
+    flow = Stencil(indices, -gradient * growth[:, None], (points.shape[1],))(v)
 
-    near, owners = _around(np.asarray(neighbors.indices), sources)
-    distance, away = _arcs(cloud, near, owners)
+    distance, away = _arcs(points, normals, near, owners)
     # Only directions count; those next to the sources are known.
     direction = _unit(flow).at[near].set(away)
-    return _integrate(cloud, neighbors, direction, near, distance, rtol)
+    return _integrate(
+        points, normals, indices, share, direction, near, distance, preconditioner, rtol
+    )
 
 
 def _warm(heat: Stencil, start, rtol: float):
@@ -134,18 +144,34 @@ def _warm(heat: Stencil, start, rtol: float):
     """
     known, given = jax.lax.stop_gradient((heat, start))
     values = _relaxed(known, given, known.diagonal, jnp.abs, rtol)
-    ratio = values[heat.indices] / values
-    near_one = eqx.tree_at(lambda s: s.weights, heat, heat.weights * ratio)
-    diagonal = jax.lax.stop_gradient(near_one.diagonal)
+    weights = heat.weights * (values[heat.indices] / values)
     # Zero; what is left of it is the derivative of the equation at its solution.
-    rest = start / values - near_one(jnp.ones_like(values))
+    rest = start / values - Stencil(heat.indices, weights)(jnp.ones_like(values))
     rest = rest - jax.lax.stop_gradient(rest)
+    return values * (1 + _zero(weights, rest, heat.indices, rtol))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
+def _zero(weights, rest, indices, rtol: float):
+    """The solution of a system whose right-hand side is zero: only its derivative is solved for."""
+    del weights, indices, rtol
+    return jnp.zeros_like(rest)
+
+
+@_zero.defjvp
+def _zero_jvp(rtol, primals, tangents):
+    weights, rest, indices = primals
+    d_weights, d_rest, _ = tangents
+    operator = Stencil(indices, weights)
+    diagonal = jax.lax.stop_gradient(operator.diagonal)
+    nothing = _zero(weights, rest, indices, rtol)
 
     def solve(matvec, b):
         largest = lambda x: jnp.max(jnp.abs(x))
         return _relaxed(matvec, b, diagonal, largest, rtol)
 
-    return values * (1 + jax.lax.custom_linear_solve(near_one, rest, solve, solve))
+    d_rest = d_rest - Stencil(indices, d_weights)(nothing)
+    return nothing, jax.lax.custom_linear_solve(operator, d_rest, solve, solve)
 
 
 def _relaxed(operator: Callable, rhs, diagonal, size: Callable, rtol: float):
@@ -171,34 +197,53 @@ def _relaxed(operator: Callable, rhs, diagonal, size: Callable, rtol: float):
     )
 
 
-def _integrate(cloud, neighbors, direction, near, distance, rtol):
-    r"""The field whose differences fit the directions and which has given values near sources.
+def _shares(mask) -> Float[np.ndarray, "k n"]:
+    """Weights of the differences, whose sum is one.
 
-    The weights of the differences do not matter where the directions are a gradient. Those here
-    fall with the rank of a neighbour: as they depend on nothing but the lists, neither does the
-    preconditioner. (With equal ones no connection would count as strong in multigrid.)
+    They do not matter where the directions are a gradient. These fall with the rank of a
+    neighbour: as they depend on nothing but the lists, neither does the preconditioner. (With equal
+    ones no connection would count as strong in multigrid.)
     """
-    x, normals = cloud.points, cloud.normals
-    with jax.ensure_compile_time_eval():  # of the lists alone, also where points are traced
-        indices, mask = neighbors.indices.T, neighbors.mask.T.at[0].set(False)
-        rank = jnp.cumsum(mask, axis=0) / (1 + jnp.sum(mask, axis=0))
-        share = jnp.where(mask, (1 - rank) ** 3, 0).astype(x.dtype)
-        share = share / jnp.sum(share, axis=0)
-        differences = Stencil(indices, (-share).at[0].set(1))
-        fixed = close(cloud, dirichlet(near, 0.0))
-        preconditioner = multigrid(differences, conditions=fixed)
+    others = mask.T.copy()
+    others[0] = False
+    rank = np.cumsum(others, axis=0) / (1 + np.sum(others, axis=0))
+    share = np.where(others, (1 - rank) ** 3, 0)
+    return share / np.sum(share, axis=0)
+
+
+def _differences(indices, share, near) -> Stencil:
+    """Value less the mean of the others, between free points; the identity next to the sources."""
+    xp = jnp if isinstance(share, jax.core.Tracer) else np
+    fixed = xp.zeros(share.shape[1], bool)
+    if xp is np:
+        fixed[near] = True
+    else:
+        fixed = fixed.at[near].set(True)
+    weights = xp.where(fixed | fixed[indices], 0, -share)
+    weights = xp.concatenate([xp.ones_like(weights[:1]), weights[1:]])
+    return Stencil(indices, weights)
+
+
+def _preconditioner(indices, share, near) -> AbstractPreconditioner:
+    operator = _differences(np.ascontiguousarray(indices.T), share, near)
+    return jax.device_put(multigrid(operator))
+
+
+def _integrate(x, normals, indices, share, direction, near, distance, preconditioner, rtol):
+    """The field whose differences fit the directions and which has given values near sources."""
+    fixed = jnp.zeros_like(x[:, 0]).at[near].set(distance)
 
     def add_slot(total, slot):
         j, w = slot
         chord = x[j] - x
         step = jnp.sum(chord * (direction + direction[j]), axis=1) / 2
-        return total - w * _bent(chord, normals[j] - normals) * step, None
+        return total - w * (_bent(chord, normals[j] - normals) * step - fixed[j]), None
 
-    rhs, _ = jax.lax.scan(add_slot, jnp.zeros(cloud.n, x.dtype), (indices, share))
-    conditions = close(cloud, dirichlet(near, distance))
-    return solve(
-        differences, rhs, conditions=conditions, preconditioner=preconditioner, rtol=rtol
-    ).value
+    rhs, _ = jax.lax.scan(add_slot, jnp.zeros_like(fixed), (indices, share))
+    # The layout's own indices, which are the same, need no comparison.
+    operator = _differences(preconditioner.incoming.indices, share, near)
+    free = solve(operator, rhs.at[near].set(0), preconditioner=preconditioner, rtol=rtol).value
+    return free + fixed
 
 
 def _bent(chord, turn):
@@ -234,14 +279,35 @@ def _source_indices(sources, n: int) -> Int[np.ndarray, " m"]:
     return sources
 
 
-def _spacing(cloud, neighbors) -> Float[Array, ""]:
+def _spacing(points, neighbors) -> Float[Array, ""]:
     """The spacing h at which k neighbours fill a disk of area k h², or a piece k h of a curve."""
     count = jnp.sum(neighbors.mask, axis=1)
-    offset = cloud.points[neighbors.indices] - cloud.points[:, None]
+    offset = points[neighbors.indices] - points[:, None]
     square = jnp.sum(jnp.where(neighbors.mask, jnp.sum(offset**2, axis=2), 0), axis=1) / count
-    return jnp.sqrt(
-        jnp.mean(12 * square / count**2 if cloud.dim == 2 else 2 * math.pi * square / count)
-    )
+    curve = points.shape[1] == 2
+    return jnp.sqrt(jnp.mean(12 * square / count**2 if curve else 2 * math.pi * square / count))
+
+
+def _paths(points, neighbors, indices, mask, sources) -> Float[Array, " n"]:
+    """Length of the shortest path from a source along neighbours; that there is one is checked."""
+    concrete = is_concrete(points)
+    row, slot = np.nonzero(mask & (indices != np.arange(len(indices))[:, None]))
+    column = indices[row, slot]
+    length = np.ones(len(row))
+    if concrete:
+        x = np.asarray(points, float)
+        length = np.linalg.norm(x[column] - x[row], axis=1)
+    links = csr_array((length, (column, row)), shape=(len(indices), len(indices)))
+    path = dijkstra(links, indices=sources, min_only=True)
+    lost = np.flatnonzero(~np.isfinite(path))
+    if lost.size:
+        raise ValueError(
+            f"no path along neighbours leads from the sources to point {lost[0]} "
+            f"({lost.size} such points)"
+        )
+    if concrete:
+        return jax.device_put(path.astype(points.dtype))
+    return _path_length(points, neighbors, sources)
 
 
 @eqx.filter_jit
@@ -260,7 +326,10 @@ def _path_length(points, neighbors, sources):
 
 
 def _around(indices, sources):
-    """Points next to a source, and for each the sources that it is next to, padded."""
+    """Points next to a source, and for each the sources that it is next to.
+
+    Both are filled up with copies to one of few sizes, so that few programs are compiled.
+    """
     k = indices.shape[1]
     pairs = np.stack([indices[sources].ravel(), np.repeat(sources, k)], axis=1)
     near, row = np.unique(pairs[:, 0], return_inverse=True)
@@ -268,20 +337,25 @@ def _around(indices, sources):
     row, owner = row[order], pairs[order, 1]
     first = np.searchsorted(row, np.arange(len(near)))
     place = np.arange(len(row)) - first[row]
-    owners = np.tile(owner[first][:, None], place.max() + 1)
+    owners = np.tile(owner[first][:, None], _room(int(place.max()) + 1))
     owners[row, place] = owner
-    return near, owners
+    full = np.minimum(np.arange(min(_room(len(near)), len(indices))), len(near) - 1)
+    return near[full].astype(np.int32), owners[full].astype(np.int32)
 
 
-def _arcs(cloud, near, owners):
+def _room(count: int) -> int:
+    """The next power of two."""
+    return 1 << (count - 1).bit_length()
+
+
+def _arcs(x, n, near, owners):
     r"""Distance of points from the nearest of their sources, and the direction away from it.
 
     A circle through both with their normals turns by $2 \arcsin a$ on the way, with
     $a = (n - n_s)\cdot e / 2$ and e the unit vector along the chord.
     """
-    x, n = cloud.points, cloud.normals
     squares = jnp.sum((x[near][:, None] - x[owners]) ** 2, axis=2)
-    source = jnp.asarray(owners)[np.arange(len(near)), jnp.argmin(squares, axis=1)]
+    source = owners[np.arange(len(near)), jnp.argmin(squares, axis=1)]
     chord = x[near] - x[source]
     at_source = source == near
     length = jnp.sqrt(jnp.where(at_source, 1, jnp.sum(chord**2, axis=1)))

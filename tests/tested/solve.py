@@ -61,7 +61,7 @@ TESTED = {
         },
         "jit": "test_geodesic.py::test_gradient_in_points_and_normals",
         "vmap": None,
-        "float32": None,
+        "float32": "test_geodesic.py::test_single_precision",
         "bad input": "malformed",
     },
     "BiCGStab": {

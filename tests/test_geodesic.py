@@ -106,18 +106,18 @@ def test_another_geometry_compiles_nothing():
             js.geodesic_distance(cloud, np.array([source]), neighbors=neighbors, method=method)
         return names
 
-    names = measured(js.sphere(1_000), 125)
+    names = measured(js.sphere(900), 125)
     assert names.count("jit(_distances)") == 1 and len(names) < 12, names
-    assert not measured(js.ellipsoid(1_000, (1.0, 0.9, 0.8)), 800)
+    assert not measured(js.ellipsoid(900, (1.0, 0.9, 0.8)), 800)
 
 
 def test_a_border():
-    """Straight ways in a square with marked border, about which nothing has to be said."""
+    """Straight ways in a square with marked border, also from its corner and along its sides."""
     cloud = js.graph(lambda x, y: 0 * x, (32, 32))
-    for source in (0, 500):
+    for source in (0, 16, 528):
         distance = js.geodesic_distance(cloud, np.array([source]))
         exact = jnp.linalg.norm(cloud.points - cloud.points[source], axis=1)
-        assert relative_error(distance, exact) < 1e-2
+        assert relative_error(distance, exact) < 2.5e-2
 
 
 def test_single_precision():

@@ -39,7 +39,7 @@ def geodesic_distance(
 
     (Crane, Weischedel and Wardetzky 2013.) Heat that leaves the sources for a time
     $t = (s h)^2$, $u - t \Delta_S u = \delta$, flows away from them: $X = -\nabla_S u / |\nabla_S
-    u|$ is the gradient of the distance. Three things differ from the usual form:
+    u|$ is the gradient of the distance. Four things differ from the usual form:
 
     - u falls like $e^{-d / \sqrt t}$, over hundreds of powers of ten. With p the length of the
       shortest path along neighbours, $v = e^{p / \sqrt t} u$ is solved for instead, by
@@ -50,9 +50,11 @@ def geodesic_distance(
       up for chords that are shorter than arcs and directions that are not along them.
     - Next to the sources the distance is prescribed: that along the circular arc that fits both
       points and their normals. So a corner in the distance is not differentiated.
+    - Where weights of the Laplacian have both signs, as along borders, it is a random walk's, which
+      keeps heat positive, and the direction is the mean of those near by.
 
     Args:
-        cloud: n points with unit normals; closed, or with borders that heat may cross unhindered.
+        cloud: n points with unit normals; borders need no conditions.
         sources: a mask, or indices; concrete.
         neighbors: lists, concrete; chosen by `method` if None (host only).
         method: of the Laplacian and the gradient; of second order, as heat has to stay positive.
@@ -120,9 +122,11 @@ def _distances(points, normals, neighbors, plain, path, known, preconditioner, s
     share, near, owners, sources = known
     indices = neighbors.indices.T
     spacing = smoothing * _spacing(points, neighbors)
+    laplacian, gradient = plain
+    mixed = jnp.any(laplacian[1:] < -1e-3 * jnp.abs(laplacian[0]), axis=0)
+    laplacian = jnp.where(mixed, _random_walk(points, indices, share), laplacian)
     # The operators on v: similar to those on u, whatever the path.
     growth = jnp.exp((path - path[indices]) / spacing)
-    laplacian, gradient = plain
     heat = Stencil(indices, laplacian * growth).scaled(-(spacing**2)).shifted(1.0)
     start = jnp.zeros_like(path).at[sources].set(1)
     v = _warm(heat, start, rtol)
@@ -130,10 +134,20 @@ def _distances(points, normals, neighbors, plain, path, known, preconditioner, s
 
     distance, away = _arcs(points, normals, near, owners)
     # Only directions count; those next to the sources are known.
-    direction = _unit(flow).at[near].set(away)
+    direction = _unit(flow)
+    others = share * ~mixed[indices]
+    replaced = mixed & (jnp.sum(others, axis=0) > 0)
+    from_others = _unit(Stencil(indices, others)(direction))
+    direction = jnp.where(replaced[:, None], from_others, direction).at[near].set(away)
     return _integrate(
         points, normals, indices, share, direction, near, distance, preconditioner, rtol
     )
+
+
+def _random_walk(points, indices, share):
+    """A Laplacian without negative weights: steps to neighbours, as often as their mean square asks."""
+    square = jnp.sum(share * jnp.sum((points[indices] - points) ** 2, axis=2), axis=0)
+    return (2 * (points.shape[1] - 1) / square) * share.at[0].set(-1)
 
 
 def _warm(heat: Stencil, start, rtol: float):

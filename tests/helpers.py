@@ -79,6 +79,22 @@ def check_derivative(f, x, *, seed=0, step=1e-5, rtol=1e-6):
     np.testing.assert_allclose(forward, expected, rtol=rtol)
 
 
+def check_derivatives(f, *xs, seed=0, step=1e-5, rtol=1e-6):
+    """As `check_derivative` in each of several arguments, with three programs for them all."""
+    rng = np.random.default_rng(seed)
+    value, push = jax.jit(f), jax.jit(lambda xs, dots: jax.jvp(f, xs, dots)[1])
+    reverse = jax.jit(jax.grad(f, argnums=tuple(range(len(xs)))))(*xs)
+    for i, x in enumerate(xs):
+        direction = jnp.asarray(rng.normal(size=x.shape))
+        direction = direction / jnp.linalg.norm(direction)
+        dots = tuple(direction if j == i else jnp.zeros_like(y) for j, y in enumerate(xs))
+        alone = lambda y, i=i: value(*xs[:i], y, *xs[i + 1 :])
+        forward = float(push(xs, dots))
+        np.testing.assert_allclose(float(jnp.vdot(reverse[i], direction)), forward, rtol=1e-9)
+        expected = central_difference(alone, x, direction, step)
+        np.testing.assert_allclose(forward, expected, rtol=rtol)
+
+
 def jittered_sphere(n, seed=0, fraction=0.25) -> js.PointCloud:
     """Fibonacci points, each moved within a ball of a fraction of the spacing."""
     points = np.asarray(js.sphere(n).points)

@@ -1,14 +1,50 @@
-"""Modes at the prompt, and their derivatives in the normals."""
+"""Solves and modes in their other forms: images, a user's preconditioner, float32, vmap, prompt."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
+import pytest
 
 import jaxsurf as js
 
-from .helpers import central_difference, count_compilations
+from .helpers import central_difference, check_derivatives, count_compilations
 
 METHOD = js.DCPSE(order=2)
+GFDM = js.GFDM(degree=2)
+
+
+def single(tree):
+    """The same arrays in single precision, to be called where x64 is off."""
+
+    def one(a):
+        a = np.asarray(a)
+        return jnp.asarray(a.astype(np.float32) if a.dtype == np.float64 else a)
+
+    return jax.tree.map(one, tree)
+
+
+@pytest.fixture(scope="module")
+def screened():
+    """-Δ + 1 on the sphere."""
+    cloud = js.sphere(320)
+    operator = js.laplace_beltrami(cloud, method=METHOD).scaled(-1.0).shifted(1.0)
+    return cloud, operator
+
+
+@pytest.fixture(scope="module", params=["neumann", "dirichlet"])
+def mirrored(request):
+    """The square [-1, 1]² continued by images, and its exact modes: cosines or sines."""
+    cloud = js.graph(lambda x, y: 0 * x, (19, 19))
+    even = request.param == "neumann"
+    wide, closure = js.with_ghosts(cloud, getattr(js, request.param)(cloud.boundary))
+    operator = js.laplace_beltrami(wide, method=GFDM)
+    x, y = wide.points[:, 0], wide.points[:, 1]
+    wave = jnp.cos if even else jnp.sin
+    first = wave(jnp.pi * (x + 1) / 2) * wave(jnp.pi * (y + 1))
+    numbers = np.array([0, 1, 1, 2] if even else [2, 5, 5, 8])
+    return cloud, operator, closure, first, numbers * np.pi**2 / 4
 
 
 # --- at the prompt --------------------------------------------------------------------------
@@ -54,3 +90,158 @@ def test_gradient_of_values_in_normals():
     expected = central_difference(total, cloud.normals, direction, 1e-3)
     found = float(jnp.vdot(jax.grad(total)(cloud.normals), direction))
     np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+# --- images ---------------------------------------------------------------------------------
+
+
+def test_solve_with_images(mirrored):
+    cloud, operator, closure, exact, _ = mirrored
+    screened = operator.scaled(-1.0).shifted(1.0)
+    rhs = (1 + 5 * np.pi**2 / 4) * exact
+    found = js.solve(screened, rhs, conditions=closure)
+    error = jnp.linalg.norm((found.value - exact)[: cloud.n]) / jnp.linalg.norm(exact[: cloud.n])
+    assert error < 0.05
+
+
+def test_modes_with_images(mirrored):
+    cloud, operator, closure, _, exact = mirrored
+    modes = js.eigenmodes(operator, 4, conditions=closure)
+    np.testing.assert_allclose(modes.values, exact, rtol=0.06, atol=1e-8)
+    assert modes.imaginary.max() < 1e-8
+    if exact[0] > 0:
+        x, y = cloud.points[:, 0], cloud.points[:, 1]
+        lowest = jnp.cos(jnp.pi * x / 2) * jnp.cos(jnp.pi * y / 2)
+        inside = modes.functions[: cloud.n, 0]
+        scale = jnp.vdot(inside, lowest) / jnp.vdot(lowest, lowest)
+        assert jnp.abs(inside / scale - lowest).max() < 0.02
+
+
+# --- a user's own preconditioner ------------------------------------------------------------
+
+
+class TwoSweeps(js.AbstractPreconditioner):
+    """Two sweeps of Jacobi's iteration, D⁻¹ (2 - A D⁻¹): what a user may write."""
+
+    operator: js.AbstractOperator
+    diagonal: jax.Array
+
+    def __call__(self, r):
+        x = r / self.diagonal
+        return 2 * x - self.operator(x) / self.diagonal
+
+    def transpose(self):
+        return Turned(self.incoming, self.mean_zero, self)
+
+
+class Turned(js.AbstractPreconditioner):
+    plain: TwoSweeps
+
+    def __call__(self, r):
+        return jax.linear_transpose(self.plain, r)(r)[0]
+
+    def transpose(self):
+        return self.plain
+
+
+def test_a_preconditioner_of_ones_own(screened):
+    cloud, operator = screened
+    z = cloud.points[:, 2]
+    rhs = jnp.exp(z)
+    expected = js.solve(operator, rhs, preconditioner=js.jacobi(operator), rtol=1e-11)
+    # The operator is well conditioned here: with h² = 0.04 its diagonal is below 200.
+    own = TwoSweeps(None, False, operator, operator.diagonal)
+    found = js.solve(operator, rhs, preconditioner=own, rtol=1e-11)
+    np.testing.assert_allclose(found.value, expected.value, rtol=1e-9)
+    assert found.stats["num_steps"] < expected.stats["num_steps"]
+
+    def total(weights, f):
+        moved = eqx.tree_at(lambda o: o.weights, operator, weights)
+        return jnp.sum(js.solve(moved, f, preconditioner=own, rtol=1e-13).value ** 3)
+
+    check_derivatives(total, operator.weights, rhs, step=1e-2)
+
+
+# --- several at once ------------------------------------------------------------------------
+
+
+def test_vmap_over_weights_and_right_hand_sides(screened):
+    cloud, operator = screened
+    f = jnp.stack([cloud.points[:, 2], jnp.exp(cloud.points[:, 0])])
+    weights = jnp.stack([operator.weights, operator.shifted(2.0).weights])
+    preconditioner = js.jacobi(operator)
+
+    @jax.jit
+    def one(weights, f):
+        moved = eqx.tree_at(lambda o: o.weights, operator, weights)
+        options = {"preconditioner": preconditioner, "mean_zero": False, "rtol": 1e-11}
+        return js.solve(moved, f, **options).value
+
+    alone = jnp.stack([one(weights[0], f[0]), one(weights[1], f[1])])
+    np.testing.assert_allclose(jax.vmap(one)(weights, f), alone, atol=1e-9)
+    np.testing.assert_allclose(jax.vmap(one, (None, 0))(weights[0], f)[0], alone[0], atol=1e-9)
+    # z is a harmonic, -Δ z = 2 z: shifts of 1 and 3.
+    z = cloud.points[:, 2]
+    many = jax.vmap(one, (0, None))(weights, z)
+    np.testing.assert_allclose(many, jnp.stack([z / 3, z / 5]), atol=2e-3)
+
+
+def test_vmap_of_reactions(screened):
+    cloud, operator = screened
+    z = cloud.points[:, 2]
+    preconditioner = js.jacobi(operator)
+
+    def one(strength):
+        rhs = 3 * z + strength * z**3
+        return js.solve_nonlinear(
+            operator, lambda u, a: a * u**3, 0 * z, args=strength, rhs=rhs,
+            preconditioner=preconditioner,
+        ).value  # fmt: skip
+
+    found = jax.jit(jax.vmap(one))(jnp.array([0.5, 2.0]))
+    np.testing.assert_allclose(found, jnp.stack([z, z]), atol=5e-3)
+    jitted = (
+        js.jacobi(operator).diagonal,
+        jax.vmap(lambda w: js.jacobi(operator.scaled(w)).diagonal),
+    )
+    np.testing.assert_allclose(jitted[1](jnp.array([1.0, 2.0]))[1], 2 * jitted[0], rtol=1e-12)
+
+
+# --- single precision -----------------------------------------------------------------------
+
+
+def test_single_precision(screened):
+    """With x64 off, JAX's default, nothing is in double precision: bounds of 1e-4 of double's."""
+    cloud, operator = screened
+    modes = js.eigenmodes(operator.scaled(-1.0), 4)
+    reaction = lambda u, a: a * u**3
+    z = cloud.points[:, 2]
+    rhs = 3 * z + z**3
+    preconditioner = js.jacobi(operator)
+    options = {"args": 1.0, "rhs": rhs, "preconditioner": preconditioner}
+    exact = js.solve_nonlinear(operator, reaction, 0 * z, **options).value
+
+    def strength_to_total(a, operator, z, rhs, preconditioner):
+        options = {"args": a, "rhs": rhs, "preconditioner": preconditioner}
+        return jnp.sum(js.solve_nonlinear(operator, reaction, 0 * z, **options).value * z)
+
+    expected = jax.grad(strength_to_total)(1.0, operator, z, rhs, preconditioner)
+    with jax.enable_x64(False):
+        operator, z, rhs = single((operator, z, rhs))
+        found = js.eigenmodes(operator.scaled(-1.0), 4)
+        assert found.values.dtype == found.functions.dtype == jnp.float32
+        np.testing.assert_allclose(found.values, modes.values, rtol=1e-4)
+        np.testing.assert_allclose(found.functions[:, 0], modes.functions[:, 0], atol=1e-3)
+        preconditioner = js.jacobi(operator)
+        assert preconditioner.diagonal.dtype == jnp.float32
+        options = {"args": 1.0, "rhs": rhs, "preconditioner": preconditioner}
+        u = js.solve_nonlinear(operator, reaction, 0 * z, **options)
+        assert u.result == optx.RESULTS.successful
+        assert u.value.dtype == jnp.float32
+        np.testing.assert_allclose(u.value, exact, atol=1e-4)
+        # Both differentiate there as well.
+        slope = jax.grad(strength_to_total)(jnp.float32(1), operator, z, rhs, preconditioner)
+        change = jax.grad(lambda s: js.eigenmodes(operator.scaled(-s), 4).values[0])(1.0)
+        assert slope.dtype == change.dtype == jnp.float32
+        np.testing.assert_allclose(change, modes.values[0], rtol=1e-3)
+    assert slope == pytest.approx(float(expected), rel=1e-3)

@@ -22,7 +22,7 @@ def hyperviscosity(
     *,
     power: int = 2,
     strength: float = 0.5,
-    spectral_radius: float | None = None,
+    spectral_radius: ArrayLike | None = None,
 ) -> AbstractOperator:
     r"""Damping $-\nu\,(-\Delta_S)^p$ that acts on the shortest waves and spares the others.
 
@@ -36,7 +36,8 @@ def hyperviscosity(
         speed: c, the largest speed of the flow or of the waves.
         power: p; the error made is $O(h^{2p - 1})$.
         strength: α.
-        spectral_radius: ρ; estimated if None (the operator must then be concrete).
+        spectral_radius: ρ, which may be traced; estimated if None (the operator must then be
+            concrete).
 
     Returns:
         The damping, to be added to the right-hand side: `stabilization=` of the problems.

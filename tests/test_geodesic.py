@@ -95,6 +95,27 @@ def test_gradient_in_points_and_normals():
     check_derivative(observed, jnp.stack([cloud.points, cloud.normals]), step=1e-4)
 
 
+def test_vmap_over_geometries():
+    """A sphere and an ellipsoid at once, as one after the other."""
+    sphere, method = js.sphere(300), js.GFDM(degree=2)
+    neighbors = js.find_neighbors(sphere, method.neighbor_count(3))
+
+    def measured(stretch):
+        axes = jnp.array([1.0, 1.0, stretch])
+        normals = sphere.points / axes
+        normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+        cloud = js.PointCloud(sphere.points * axes, normals)
+        how = {"neighbors": neighbors, "method": method, "rtol": 1e-12}
+        return js.geodesic_distance(cloud, np.array([10, 200]), **how)
+
+    stretches = jnp.array([1.0, 1.3])
+    one = jax.jit(measured)
+    alone = jnp.stack([one(s) for s in stretches])
+    assert relative_error(alone[1], alone[0]) > 0.05  # there are two of them
+    np.testing.assert_allclose(jax.jit(jax.vmap(measured))(stretches), alone, atol=1e-9)
+    assert relative_error(alone[0], exact_on_sphere(sphere, jnp.array([10, 200]))) < 5e-2
+
+
 def test_another_geometry_compiles_nothing():
     method = js.GFDM(degree=2)
 

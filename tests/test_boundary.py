@@ -193,6 +193,23 @@ def test_points_that_are_declared_free():
 
 
 @pytest.mark.core
+def test_points_that_are_declared_free_under_transformations():
+    """Nothing happens to a field: under jit, vmap and grad, and in single precision."""
+    cloud = square(9)
+    u = jnp.asarray(np.random.default_rng(0).normal(size=(2, cloud.n)))
+
+    def filled(u):
+        return js.close(cloud, js.free(np.asarray(cloud.boundary)))(u)
+
+    np.testing.assert_array_equal(jax.jit(jax.vmap(filled))(u), u)
+    slope = jax.grad(lambda u: jnp.vdot(jnp.sin(u), filled(u)))(u[0])
+    np.testing.assert_allclose(slope, jnp.sin(u[0]) + u[0] * jnp.cos(u[0]), atol=1e-14)
+    low = u[0].astype(jnp.float32)
+    assert filled(low).dtype == jnp.float32
+    np.testing.assert_array_equal(filled(low), low)
+
+
+@pytest.mark.core
 def test_ghosts_beside_points_that_are_free():
     cloud = square(9)
     border = np.asarray(cloud.boundary)

@@ -352,6 +352,22 @@ def test_derivative_of_the_double_torus_with_its_curvature():
     np.testing.assert_allclose(slope, difference(value, 0.4), rtol=1e-7)
 
 
+def test_double_tori_of_several_thicknesses_at_once():
+    points = level_set(double_torus(0.4)[0], n=60, bounds=double_torus(0.4)[1]).points
+
+    def moved(thickness):
+        phi = double_torus(thickness)[0]
+        found = project_to_level_set(phi, points)
+        return found, jax.vmap(phi)(found)
+
+    thicknesses = jnp.array([0.4, 0.45])
+    found, values = jax.jit(jax.vmap(moved))(thicknesses)
+    assert jnp.abs(values).max() < 1e-13
+    alone = jax.jit(lambda t: moved(t)[0])
+    np.testing.assert_allclose(found, jnp.stack([alone(t) for t in thicknesses]), atol=1e-13)
+    assert jnp.abs(found[0] - found[1]).max() > 0.02
+
+
 def test_projection_follows_the_parameters_of_a_module():
     import equinox as eqx
 

@@ -20,7 +20,7 @@ _METHODS: dict[Method, int] = {js.DCPSE(order=r): r for r in (2, 3, 4)} | {
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    sizes = [2_000, 4_000, 8_000] if quick else [2_000, 4_000, 8_000, 16_000, 32_000]
+    sizes = [1_000, 2_000, 4_000, 8_000] if quick else [2_000, 4_000, 8_000, 16_000, 32_000]
     shapes = [surfaces.sphere(), surfaces.ellipsoid(), surfaces.torus()]
     rows: list[Row] = []
     progress = tqdm(total=len(shapes) * len(_KINDS) * len(sizes) * len(_METHODS), desc="slopes")

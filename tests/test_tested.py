@@ -42,14 +42,16 @@ def test_every_column_says_something(name):
     assert not unknown, f"no such columns: {unknown}"
     absent = [column for column in tested.COLUMNS if column not in ROWS[name]]
     assert not absent, f"{name} says nothing of {absent}"
-    assert ROWS[name]["value"] is not None
+    empty = [column for column, entry in ROWS[name].items() if not entry]
+    assert not empty, f"{name} has nothing for {empty}"
+    assert tested.tests_of(ROWS[name]["value"]), f"no test of the value of {name}"
 
 
 @pytest.mark.parametrize("name", ROWS)
 def test_tests_exist(name):
     for column, entry in ROWS[name].items():
         named = tested.tests_of(entry)
-        words = [entry] if isinstance(entry, str) else list((entry or {}).values())
+        words = [entry] if isinstance(entry, str) else list(entry.values())
         assert named or all(w == "malformed" or w[0] == "(" for w in words), f"{column}: {entry}"
         for test in named:
             file, function = re.sub(r"\[.*", "", test).split("::")

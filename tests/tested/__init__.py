@@ -8,9 +8,9 @@ from __future__ import annotations
 import importlib
 import pkgutil
 
-# A test as "file.py::function"; "malformed" for the corpus; a reason in brackets, as in
-# "(host only: concrete arrays)", or None where a column makes no sense for the name.
-Entry = str | dict[str, str] | None
+# A test as "file.py::function"; "malformed" for the corpus; where a column makes no sense for the
+# name, why, in brackets, as in "(host only: concrete arrays)". No cell is empty.
+Entry = str | dict[str, str]
 COLUMNS = ("value", "gradient", "jit", "vmap", "float32", "bad input")
 
 
@@ -26,8 +26,6 @@ def tables() -> dict[str, dict[str, dict[str, Entry]]]:
 
 def tests_of(entry: Entry) -> list[str]:
     """The tests that an entry names."""
-    if entry is None:
-        return []
     if isinstance(entry, dict):
         return [test for part in entry.values() for test in tests_of(part)]
     return [test.strip() for test in entry.split(",") if "::" in test and test[0] != "("]
@@ -39,11 +37,11 @@ def markdown() -> str:
     def cell(entry: Entry) -> str:
         if isinstance(entry, dict):
             return ", ".join(f"{name}: {cell(test)}" for name, test in entry.items())
-        return "–" if entry is None else entry.replace(".py::", " ")
+        return entry.replace(".py::", " ")
 
     lines = ["| name | " + " | ".join(COLUMNS) + " |", "| --- " * (1 + len(COLUMNS)) + "|"]
     for table in tables().values():
         for name, row in sorted(table.items()):
-            cells = [cell(row.get(column)) for column in COLUMNS]
+            cells = [cell(row[column]) for column in COLUMNS]
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)

@@ -5,6 +5,7 @@ _ONLY = "(host only: concrete arrays)"
 _F32 = _B + "test_single_precision"
 _GRAD, _VMAP = _B + "test_derivatives_of_the_closure", _B + "test_closures_and_conormals_under_vmap"
 _NU, _GHOSTS = _B + "test_derivatives_of_conormals", _B + "test_ghosts_under_transformations"
+_FREE = _B + "test_points_that_are_declared_free_under_transformations"
 
 
 def _row(value, gradient, jit, vmap, float32=_F32) -> dict:
@@ -28,7 +29,7 @@ TESTED = {
     "neumann": _condition("value", "conormals"),
     "robin": _condition("value", "a", "b", "conormals"),
     "Condition": _condition("value", "a", "b", "conormals"),
-    "free": _row("test_points_that_are_declared_free", None, None, None, None),
+    "free": _row("test_points_that_are_declared_free", {"field": _FREE}, _FREE, _FREE, _FREE),
     "close": _row(
         "test_poisson_with_one_sided_stencils",
         dict.fromkeys(["points", "normals", "value", "a", "b", "conormals"], _GRAD),

@@ -2,6 +2,9 @@
 
 _HOST = "(host only: concrete arrays; refused under jit: malformed)"
 _INTEGERS = "(integers)"
+_SIZES = "(static sizes: integers)"
+_ABSTRACT = "(declared, not called)"
+_REPORT = "(a report, constant for derivatives)"
 _FORMS = "test_forms.py::"
 
 
@@ -22,6 +25,7 @@ _GEOMETRY = ("points", "normals")
 _FIELD = {"field": "test_gradients.py::test_field_and_coefficients"}
 _DIFFUSION = _FORMS + "test_gradients_of_diffusion_in_each_argument"
 _POLYNOMIALS = _FORMS + "test_every_polynomial_of_the_basis_is_exact"
+_HIGH = _FORMS + "test_every_polynomial_of_high_degree_is_exact_inside"
 
 TESTED = {
     "PointCloud": {
@@ -34,7 +38,7 @@ TESTED = {
     },
     "Neighbors": {
         "value": "test_neighbors.py::test_nearest_against_brute_force",
-        "gradient": None,
+        "gradient": _INTEGERS,
         "jit": "test_neighbors.py::test_search_under_jit_vmap_and_grad",
         "vmap": "test_neighbors.py::test_search_under_jit_vmap_and_grad",
         "float32": "test_neighbors.py::test_both_searches_agree_on_ties_and_thin_parts",
@@ -53,7 +57,7 @@ TESTED = {
     "choose_neighbors": {
         "value": "test_stability.py::test_irregular_points_get_larger_neighborhoods, "
         "test_forms.py::test_where_no_neighbourhood_serves",
-        "gradient": None,
+        "gradient": _INTEGERS,
         "jit": _HOST,
         "vmap": _HOST,
         "float32": "test_operators.py::test_single_precision",
@@ -61,15 +65,15 @@ TESTED = {
     },
     "SearchCapacity": {
         "value": "test_neighbors.py::test_capacity_exceeded_gives_both_numbers",
-        "gradient": None,
-        "jit": None,
-        "vmap": None,
-        "float32": None,
+        "gradient": _SIZES,
+        "jit": _SIZES,
+        "vmap": _SIZES,
+        "float32": _SIZES,
         "bad input": "malformed",
     },
     "allocate": {
         "value": "test_neighbors.py::test_capacity_exceeded_gives_both_numbers",
-        "gradient": None,
+        "gradient": _INTEGERS,
         "jit": "test_neighbors.py::test_misuse_is_refused",
         "vmap": _HOST,
         "float32": "test_neighbors.py::test_both_searches_agree_on_ties_and_thin_parts",
@@ -172,7 +176,7 @@ TESTED = {
     },
     "DCPSE": {
         "value": "test_accuracy.py::test_convergence_on_the_sphere, "
-        "test_forms.py::test_every_polynomial_of_the_surface_basis_is_exact",
+        "test_forms.py::test_every_polynomial_of_the_surface_basis_is_exact, " + _HIGH,
         "gradient": {"points": "test_gradients.py::test_operators_in_points_and_normals"},
         "jit": "test_operators.py::test_jit_and_vmap_equal_the_plain_call",
         "vmap": "test_operators.py::test_jit_and_vmap_equal_the_plain_call",
@@ -180,7 +184,7 @@ TESTED = {
         "bad input": "malformed",
     },
     "GFDM": {
-        "value": "test_accuracy.py::test_convergence_on_the_sphere, " + _POLYNOMIALS,
+        "value": "test_accuracy.py::test_convergence_on_the_sphere, " + _POLYNOMIALS + ", " + _HIGH,
         "gradient": {"points": "test_gradients.py::test_operators_in_points_and_normals"},
         "jit": "test_operators.py::test_jit_and_vmap_equal_the_plain_call",
         "vmap": "test_operators.py::test_jit_and_vmap_equal_the_plain_call",
@@ -199,24 +203,24 @@ TESTED = {
         "value": _FORMS + "test_a_users_own_method",
         "gradient": {"points": _FORMS + "test_a_users_own_method"},
         "jit": _FORMS + "test_a_users_own_method",
-        "vmap": None,
-        "float32": None,
-        "bad input": None,
+        "vmap": _FORMS + "test_a_users_own_method_in_other_forms",
+        "float32": _FORMS + "test_a_users_own_method_in_other_forms",
+        "bad input": _ABSTRACT,
     },
     "AbstractOperator": {
         "value": "test_operators.py::test_matrix_transpose_and_lineax_agree",
-        "gradient": None,
-        "jit": None,
-        "vmap": None,
-        "float32": None,
+        "gradient": {"field": "test_gradients.py::test_other_operators_and_curvature"},
+        "jit": "test_gradients.py::test_other_operators_and_curvature",
+        "vmap": _FORMS + "test_mapped",
+        "float32": _FORMS + "test_single_precision",
         "bad input": "malformed",
     },
     "Diagnostics": {
         "value": "test_bad_input.py::test_points_on_a_line",
-        "gradient": None,
+        "gradient": _REPORT,
         "jit": "test_moments.py::test_points_of_a_block_do_not_mix",
-        "vmap": None,
-        "float32": None,
-        "bad input": None,
+        "vmap": _FORMS + "test_diagnostics_in_other_forms",
+        "float32": _FORMS + "test_diagnostics_in_other_forms",
+        "bad input": "(made by operators)",
     },
 }

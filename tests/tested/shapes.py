@@ -40,7 +40,7 @@ TESTED = {
             "thickness": _SHAPES + "test_derivative_of_the_double_torus_with_its_curvature"
         },
         "jit": _SHAPES + "test_derivative_of_the_double_torus_with_its_curvature",
-        "vmap": None,
+        "vmap": _SHAPES + "test_double_tori_of_several_thicknesses_at_once",
         "float32": _SINGLE,
         "bad input": "malformed",
     },

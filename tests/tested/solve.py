@@ -1,13 +1,16 @@
 """Steady problems, eigenmodes, distances."""
 
 _RESULT = "(made by eigenmodes)"
+_SOLVES = "test_solve_forms.py::"
 
 TESTED = {
     "solve": {
         "value": "test_steady.py::test_poisson_on_the_closed_sphere_converges, "
         "test_steady.py::test_screened_anisotropic_and_helmholtz, "
         "test_steady.py::test_what_is_incompatible_is_an_error, "
-        "test_steady.py::test_numbers_of_any_size",
+        "test_steady.py::test_numbers_of_any_size, "
+        "test_solve_forms.py::test_solve_with_images, "
+        "test_solve_forms.py::test_a_preconditioner_of_ones_own",
         "gradient": {
             "weights": "test_steady.py::test_derivatives_in_weights_and_right_hand_side",
             "rhs": "test_steady.py::test_derivatives_in_weights_and_right_hand_side",
@@ -15,7 +18,8 @@ TESTED = {
             "points": "test_steady.py::test_derivative_in_the_geometry",
         },
         "jit": "test_steady.py::test_no_retracing_for_other_values",
-        "vmap": "test_steady.py::test_several_right_hand_sides_and_transformations",
+        "vmap": "test_steady.py::test_several_right_hand_sides_and_transformations, "
+        "test_solve_forms.py::test_vmap_over_weights_and_right_hand_sides",
         "float32": "test_steady.py::test_single_precision",
         "bad input": "malformed",
     },
@@ -26,12 +30,13 @@ TESTED = {
             "coupled reaction": "test_newton.py::test_a_reaction_that_couples_points",
         },
         "jit": "test_newton.py::test_derivatives",
-        "vmap": None,
-        "float32": None,
+        "vmap": _SOLVES + "test_vmap_of_reactions",
+        "float32": _SOLVES + "test_single_precision",
         "bad input": "malformed",
     },
     "eigenmodes": {
-        "value": "test_eigen.py::test_groups_of_the_sphere",
+        "value": "test_eigen.py::test_groups_of_the_sphere, "
+        "test_solve_forms.py::test_modes_with_images",
         "gradient": {
             "weights": "test_eigen.py::test_derivative_of_simple_values, "
             "test_eigen.py::test_derivative_of_simple_functions",
@@ -42,7 +47,8 @@ TESTED = {
         "jit": "test_eigen.py::test_under_jit_and_vmap, "
         "test_solve_forms.py::test_modes_of_another_operator_compile_nothing",
         "vmap": "test_eigen.py::test_under_jit_and_vmap",
-        "float32": "test_eigen.py::test_single_precision",
+        "float32": "test_eigen.py::test_single_precision, "
+        "test_solve_forms.py::test_single_precision",
         "bad input": "malformed",
     },
     "Eigenmodes": {
@@ -60,7 +66,7 @@ TESTED = {
             "normals": "test_geodesic.py::test_gradient_in_points_and_normals",
         },
         "jit": "test_geodesic.py::test_gradient_in_points_and_normals",
-        "vmap": None,
+        "vmap": "test_geodesic.py::test_vmap_over_geometries",
         "float32": "test_geodesic.py::test_single_precision",
         "bad input": "malformed",
     },
@@ -68,7 +74,8 @@ TESTED = {
         "value": "test_steady.py::test_poisson_on_the_closed_sphere_converges",
         "gradient": "(derivatives of solve are implicit)",
         "jit": "test_steady.py::test_no_retracing_for_other_values",
-        "vmap": "test_steady.py::test_several_right_hand_sides_and_transformations",
+        "vmap": "test_steady.py::test_several_right_hand_sides_and_transformations, "
+        "test_solve_forms.py::test_vmap_over_weights_and_right_hand_sides",
         "float32": "test_steady.py::test_single_precision",
         "bad input": "malformed",
     },
@@ -92,16 +99,16 @@ TESTED = {
         "value": "test_precondition.py::test_jacobi_is_the_diagonal",
         "gradient": "(not differentiated: derivatives of solve are implicit)",
         "jit": "test_steady.py::test_derivatives_with_conditions_and_jacobi",
-        "vmap": None,
-        "float32": None,
+        "vmap": _SOLVES + "test_vmap_of_reactions",
+        "float32": _SOLVES + "test_single_precision",
         "bad input": "malformed",
     },
     "Jacobi": {
         "value": "test_precondition.py::test_jacobi_is_the_diagonal",
         "gradient": "(not differentiated: derivatives of solve are implicit)",
         "jit": "test_steady.py::test_derivatives_with_conditions_and_jacobi",
-        "vmap": None,
-        "float32": None,
+        "vmap": _SOLVES + "test_vmap_of_reactions",
+        "float32": _SOLVES + "test_single_precision",
         "bad input": "malformed",
     },
 }

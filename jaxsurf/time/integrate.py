@@ -144,7 +144,8 @@ def steady_state(*, rtol: float = 1e-4, atol: float = 1e-6) -> dfx.Event:
 
     When $\|\partial_t u\| < \text{atol} + \text{rtol}\,\|u\|$, in the root mean square, per unit
     of time. Tolerances below those of the integration are met late: the errors of long steps
-    keep the state moving.
+    keep the state moving, and those of explicit solvers like `diffrax.Tsit5`, at the limit of
+    stability, may do so for ever.
 
     Example:
         >>> problem = js.AdvectionDiffusionReaction(js.laplace_beltrami(js.sphere(500)))

@@ -1,7 +1,6 @@
 """Every experiment runs in its quick version and keeps its bounds."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -15,9 +14,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_quick(name, tmp_path):
+def test_quick(name, tmp_path, environment):
     # Not double precision by the environment: the command itself must ask for it.
-    environment = {k: v for k, v in os.environ.items() if k != "JAX_ENABLE_X64"}
+    environment = {k: v for k, v in environment.items() if k != "JAX_ENABLE_X64"}
     call = [sys.executable, "-m", "experiments", "run", name.lower(), "--quick", "--out", tmp_path]
     done = subprocess.run(call, cwd=ROOT, env=environment, capture_output=True, text=True)
     if "skipped" in done.stdout:

@@ -145,7 +145,7 @@ def _distances(points, normals, neighbors, plain, path, known, preconditioner, s
 
 
 def _random_walk(points, indices, share):
-    """A Laplacian without negative weights: steps to neighbours, as often as their mean square asks."""
+    """A Laplacian without negative weights: steps to neighbours, as often as their size asks."""
     square = jnp.sum(share * jnp.sum((points[indices] - points) ** 2, axis=2), axis=0)
     return (2 * (points.shape[1] - 1) / square) * share.at[0].set(-1)
 

@@ -378,17 +378,16 @@ class _Relative(lx.AbstractLinearSolver):
         scale = jnp.where(norm > 0, norm, 1)
         unit = jax.tree.map(lambda v: v / scale, vector)
         x, result, stats = self.solver.compute(krylov, unit, options)
-        missed = lambda x: root_mean_square(jax.tree.map(jnp.subtract, operator.mv(x), unit))
+        missed = lambda image: root_mean_square(jax.tree.map(jnp.subtract, image, unit))
         # Where a multiple of the right-hand side solves the system (zero, constants, eigenvectors),
         # BiCGStab divides zero by zero.
         image = operator.mv(unit)
         inner = lambda a, b: sum(jnp.vdot(*pair) for pair in zip(*map(jax.tree.leaves, (a, b))))
         length = inner(image, image)
         factor = inner(unit, image) / jnp.where(length > 0, length, 1)
-        multiple = jax.tree.map(lambda u: factor * u, unit)
-        simple = missed(multiple) <= self.tolerance
-        x = jax.tree.map(lambda x, u: jnp.where(simple, u, x), x, multiple)
-        good = missed(x) <= 10 * self.tolerance
+        simple = missed(jax.tree.map(lambda a: factor * a, image)) <= self.tolerance
+        x = jax.tree.map(lambda x, u: jnp.where(simple, factor * u, x), x, unit)
+        good = missed(operator.mv(x)) <= 10 * self.tolerance
         # Too many steps of this solver are not to be mistaken for too many steps in time.
         mild = (result == lx.RESULTS.successful) | (result == lx.RESULTS.max_steps_reached)
         result = lx.RESULTS.where(

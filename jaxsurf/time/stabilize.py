@@ -2,6 +2,7 @@ r"""Numerical damping for advection and waves, of the size of what the points do
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
@@ -115,15 +116,21 @@ def upwinding(
     spacing = cloud.spacing
     if spacing is None:
         near = find_neighbors(cloud, 2, throw=False) if neighbors is None else neighbors
-        spacing = _nearest(cloud, near)
-    speed = jnp.linalg.norm(velocity, axis=1)
-    return diffusion(cloud, 0.5 * strength * spacing * speed, neighbors=neighbors, method=method)
+        spacing = _nearest(cloud.points, near)
+    viscosity = _viscosity(spacing, velocity, strength)
+    return diffusion(cloud, viscosity, neighbors=neighbors, method=method)
 
 
-def _nearest(cloud: PointCloud, neighbors: Neighbors) -> Float[Array, " n"]:
+@jax.jit
+def _viscosity(spacing, velocity, strength) -> Float[Array, " n"]:
+    return 0.5 * strength * spacing * jnp.linalg.norm(velocity, axis=1)
+
+
+@jax.jit
+def _nearest(points, neighbors: Neighbors) -> Float[Array, " n"]:
     """Distance to the nearest other point of each list."""
-    offsets = cloud.points[neighbors.indices] - cloud.points[:, None]
+    offsets = points[neighbors.indices] - points[:, None]
     squares = jnp.sum(offsets**2, axis=-1)
-    other = neighbors.mask & (neighbors.indices != jnp.arange(cloud.n)[:, None])
+    other = neighbors.mask & (neighbors.indices != jnp.arange(len(points))[:, None])
     # The largest where there is no other, so that nothing is divided by zero on the way back.
     return jnp.sqrt(jnp.min(jnp.where(other, squares, jnp.max(squares)), axis=1))

@@ -7,7 +7,6 @@ Most of the time of a test is compilation, of programs that run for milliseconds
 optimised here; the commands that tests start (experiments, demo) compile as users do.
 """
 
-import importlib.metadata
 import importlib.util
 import os
 from pathlib import Path
@@ -18,12 +17,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # what is loaded from it was tuned: no news
 os.environ.setdefault("MPLBACKEND", "Agg")
 _as_users = dict(os.environ)
-# Eight times as fast for the program that builds stencils. A flag that a version does not know
-# ends the process.
-_quick = "--xla_backend_optimization_level=0"
-if importlib.metadata.version("jaxlib").startswith("0.10."):
-    _quick += " --xla_cpu_use_fusion_emitters=false"
-os.environ["XLA_FLAGS"] = f"{_quick} {os.environ.get('XLA_FLAGS', '')}"
+os.environ["XLA_FLAGS"] = f"--xla_backend_optimization_level=0 {os.environ.get('XLA_FLAGS', '')}"
 
 import jax
 import pytest

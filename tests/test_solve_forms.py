@@ -92,6 +92,24 @@ def test_gradient_of_values_in_normals():
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
+def test_other_reactions_compile_nothing(screened):
+    """Other numbers and new lambdas of the same code; what a lambda closes over is a number too."""
+    cloud, operator = screened
+    z, preconditioner = cloud.points[:, 2], js.jacobi(operator)
+
+    def total(strength, rate):
+        reaction = lambda u, a: strength * u + a * u**3
+        options = {"args": rate, "rhs": z, "preconditioner": preconditioner, "rtol": 1e-12}
+        return jnp.sum(js.solve_nonlinear(operator, reaction, 0 * z, **options).value ** 2)
+
+    total(1.0, 2.0)
+    with count_compilations() as names:
+        low, high = (total(1.1 + change, 2.1) for change in (-1e-4, 1e-4))
+    assert not names
+    slope = jax.grad(total)(1.1, 2.1)
+    assert float(slope) == pytest.approx(float(high - low) / 2e-4, rel=1e-6)
+
+
 # --- images ---------------------------------------------------------------------------------
 
 

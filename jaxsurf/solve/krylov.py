@@ -123,7 +123,7 @@ def norm(x: Float[Array, " n"]) -> Float[Array, ""]:
     return scale * jnp.linalg.norm(x / scale)
 
 
-def numbers_as_arrays(solver):
+def tolerances_as_arrays(solver):
     """A solver with its tolerances as arrays: programs are then compiled once for all of them."""
     kinds = (float, int) if isinstance(solver, BiCGStab) else float
     return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, kinds) else x, solver)

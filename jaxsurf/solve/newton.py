@@ -16,8 +16,9 @@ from jaxtyping import Array, Float
 
 from ..arguments import as_float, is_concrete, whole
 from ..boundary import Closure
+from ..functions import canonical, numbers_as_arrays
 from ..stencils.stencil import AbstractOperator, Stencil
-from .krylov import BiCGStab, numbers_as_arrays
+from .krylov import BiCGStab, tolerances_as_arrays
 from .padded import matching_layout
 from .precondition import AbstractPreconditioner, multigrid
 from .system import Inverse, Linearised, System, check_system, tolerance
@@ -110,6 +111,9 @@ def solve_nonlinear(
         name, values = ("u0", u0) if not np.isfinite(u0).all() else ("right-hand side", rhs)
         i = int(np.argmin(np.isfinite(np.ravel(values))))
         raise ValueError(f"{name} is not finite at point {i}")
+    # Programs and arrays: other numbers, or the same code in a new lambda, compile nothing.
+    args = numbers_as_arrays(args)
+    reaction = canonical(reaction, u0, args)
     problem = _Problem(operator, conditions, reaction, args, rhs)
     if preconditioner is None:
         preconditioner = multigrid(_shifted(operator, problem.slope(u0)), conditions=conditions)
@@ -121,7 +125,7 @@ def solve_nonlinear(
     layout = matching_layout(preconditioner.incoming, operator)
     concrete = is_concrete(*jax.tree.leaves((problem, u0, preconditioner)))
     numbers = np.asarray(rtol), np.asarray(float(atol)), np.asarray(max_steps)
-    solver = None if solver is None else numbers_as_arrays(solver)
+    solver = None if solver is None else tolerances_as_arrays(solver)
     limits = (*numbers, throw and not concrete)
     solution = _solve(problem, u0, layout, preconditioner, solver, *limits)
     if throw and concrete and bool(solution.result != optx.RESULTS.successful):

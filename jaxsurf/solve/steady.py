@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from ..arguments import as_float, is_concrete, whole
 from ..boundary import Closure
 from ..stencils.stencil import AbstractOperator
-from .krylov import BiCGStab, numbers_as_arrays, scale_of
+from .krylov import BiCGStab, scale_of, tolerances_as_arrays
 from .padded import matching_layout
 from .precondition import AbstractPreconditioner, hierarchy, without_layout
 from .reduced import annihilates_constants, reduced_matrix
@@ -118,7 +118,7 @@ def solve(
     layout = None if concrete else matching_layout(preconditioner.incoming, operator)
     preconditioner = without_layout(preconditioner)
     limits = np.asarray(rtol), np.asarray(float(atol)), np.asarray(given), np.asarray(bool(project))
-    problem = (operator, layout, conditions, preconditioner, numbers_as_arrays(solver), limits)
+    problem = (operator, layout, conditions, preconditioner, tolerances_as_arrays(solver), limits)
     solution = _solve(rhs, *problem, bool(mean_zero), throw and not concrete)
     if throw and concrete:
         _raise_on_failure(solution, rhs.dtype, rtol, atol)

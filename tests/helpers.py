@@ -58,40 +58,42 @@ def relative_error(value, exact) -> float:
     return float(jnp.linalg.norm(value - exact) / jnp.linalg.norm(exact))
 
 
-def central_difference(f, x, direction, step=1e-5) -> float:
+def central_difference(f, x, direction, step=1e-5):
     """Derivative of f along a direction, by two central differences extrapolated."""
 
     def difference(h):
-        return float(f(x + h * direction) - f(x - h * direction)) / (2 * h)
+        return np.asarray(f(x + h * direction) - f(x - h * direction), float) / (2 * h)
 
     return (4 * difference(step / 2) - difference(step)) / 3
 
 
 def check_derivative(f, x, *, seed=0, step=1e-5, rtol=1e-6):
-    """Forward and reverse derivative of a scalar function against central differences."""
-    direction = jnp.asarray(np.random.default_rng(seed).normal(size=x.shape))
-    direction = direction / jnp.linalg.norm(direction)
-    f = jax.jit(f)
-    expected = central_difference(f, x, direction, step)
-    forward = float(jax.jvp(f, (x,), (direction,))[1])
-    reverse = float(jnp.vdot(jax.jit(jax.grad(f))(x), direction))
-    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
-    np.testing.assert_allclose(forward, expected, rtol=rtol)
+    """As `check_derivatives` in one argument."""
+    check_derivatives(f, x, seed=seed, step=step, rtol=rtol)
 
 
 def check_derivatives(f, *xs, seed=0, step=1e-5, rtol=1e-6):
-    """As `check_derivative` in each of several arguments, with three programs for them all."""
+    """Forward and reverse derivative in each argument against central differences.
+
+    Two programs are compiled, however many arguments there are and however many values f has: each
+    value is checked on its own, and the forward program also gives those at the shifted arguments.
+    """
     rng = np.random.default_rng(seed)
-    value, push = jax.jit(f), jax.jit(lambda xs, dots: jax.jvp(f, xs, dots)[1])
-    reverse = jax.jit(jax.grad(f, argnums=tuple(range(len(xs)))))(*xs)
-    for i, x in enumerate(xs):
-        direction = jnp.asarray(rng.normal(size=x.shape))
-        direction = direction / jnp.linalg.norm(direction)
-        dots = tuple(direction if j == i else jnp.zeros_like(y) for j, y in enumerate(xs))
-        alone = lambda y, i=i: value(*xs[:i], y, *xs[i + 1 :])
-        forward = float(push(xs, dots))
-        np.testing.assert_allclose(float(jnp.vdot(reverse[i], direction)), forward, rtol=1e-9)
-        expected = central_difference(alone, x, direction, step)
+    push = jax.jit(lambda xs, dots: jax.jvp(f, xs, dots))
+    pull = jax.jit(lambda xs, dots: jax.vjp(f, *xs)[1](dots))
+    directions = [jnp.asarray(rng.normal(size=jnp.shape(x))) for x in xs]
+    directions = [direction / jnp.linalg.norm(direction) for direction in directions]
+    pulled = None
+    for i, (x, own) in enumerate(zip(xs, directions)):
+        dots = tuple(d if j == i else jnp.zeros_like(d) for j, d in enumerate(directions))
+        value, forward = push(xs, dots)
+        if pulled is None:
+            units = np.eye(value.size).reshape(value.size, *value.shape)
+            pulled = [pull(xs, jnp.asarray(unit, value.dtype)) for unit in units]
+        reverse = np.reshape([float(jnp.vdot(by[i], own)) for by in pulled], value.shape)
+        alone = lambda y, i=i, dots=dots: push((*xs[:i], y, *xs[i + 1 :]), dots)[0]
+        expected = central_difference(alone, x, own, step)
+        np.testing.assert_allclose(reverse, forward, rtol=1e-9)
         np.testing.assert_allclose(forward, expected, rtol=rtol)
 
 

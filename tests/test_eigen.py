@@ -1,5 +1,7 @@
 """Eigenmodes: values, groups, bases, conditions, and derivatives against central differences."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,7 @@ import pytest
 import jaxsurf as js
 from jaxsurf.solve import inverse
 
-from .helpers import central_difference, check_derivative, jittered_sphere
+from .helpers import check_derivative, jittered_sphere
 
 # Minutes in all.
 pytestmark = pytest.mark.slow
@@ -17,14 +19,16 @@ pytestmark = pytest.mark.slow
 _SPHERE = np.repeat([0.0, 2.0, 6.0, 12.0, 20.0], [1, 3, 5, 7, 9])
 
 
-def laplacian(cloud, order=4):
-    return js.laplace_beltrami(cloud, method=js.DCPSE(order=order))
+@functools.cache
+def laplacian(n, order=4):
+    """Of the sphere; few sizes, as each takes seconds to compile."""
+    return js.laplace_beltrami(js.sphere(n), method=js.DCPSE(order=order))
 
 
 @pytest.fixture(scope="module")
 def sphere_modes():
     cloud = js.sphere(2_000)
-    return cloud, js.eigenmodes(laplacian(cloud), 25)
+    return cloud, js.eigenmodes(laplacian(cloud.n), 25)
 
 
 @pytest.mark.core
@@ -51,7 +55,7 @@ def test_functions_of_the_sphere(sphere_modes):
 def test_a_basis_belongs_to_its_space_alone(sphere_modes):
     """Neither noise in the operator nor the number of modes asked for turns the functions."""
     cloud, modes = sphere_modes
-    operator = laplacian(cloud)
+    operator = laplacian(cloud.n)
     noise = jnp.asarray(np.random.default_rng(0).normal(size=cloud.n))
     again = js.eigenmodes(operator.scaled(1 + 1e-9 * noise), 18)
     np.testing.assert_allclose(again.functions[:, :9], modes.functions[:, :9], atol=1e-6)
@@ -59,13 +63,14 @@ def test_a_basis_belongs_to_its_space_alone(sphere_modes):
 
 def test_values_converge_at_the_order_of_the_method():
     def error(n, order):
-        values = js.eigenmodes(laplacian(js.sphere(n), order), 9).values
+        values = js.eigenmodes(laplacian(n, order), 9).values
         return np.abs(values[1:] / _SPHERE[1:9] - 1).max()
 
-    for order in (2, 4):
-        fine = error(6_000, order)
-        assert fine < {2: 2e-3, 4: 1.5e-5}[order]
-        assert np.log2(error(1_500, order) / fine) > order - 0.2
+    # Fourth order is not seen before 1,500 points.
+    for order, coarse, bound in ((2, 500, 6e-3), (4, 1_500, 1.5e-5)):
+        fine = error(4 * coarse, order)
+        assert fine < bound
+        assert np.log2(error(coarse, order) / fine) > order - 0.2
 
 
 def test_dirichlet_conditions():
@@ -116,67 +121,40 @@ _ELLIPSOID = js.ellipsoid(350, (1.0, 0.8, 0.65))
 _NEIGHBORS = js.choose_neighbors(_ELLIPSOID, method=_METHOD)
 
 
-def check(f, x, *, step=1e-4):
-    """As `check_derivative`, outside jit: programs that call the host are compiled every time."""
-    direction = jnp.asarray(np.random.default_rng(0).normal(size=x.shape))
-    direction = direction / jnp.linalg.norm(direction)
-    expected = central_difference(f, x, direction, step)
-    forward = float(jax.jvp(f, (x,), (direction,))[1])
-    reverse = float(jnp.vdot(jax.grad(f)(x), direction))
-    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
-    np.testing.assert_allclose(forward, expected, rtol=1e-6)
-
-
 def _moved(cloud, neighbors, points):
     return js.laplace_beltrami(js.PointCloud(points, cloud.normals), neighbors, method=_METHOD)
 
 
-def test_derivative_of_simple_values():
+def test_derivatives_of_simple_modes():
     weight = jnp.array([0.0, 1.0, -2.0, 3.0, 0.5, 1.0])
-
-    def total(points):
-        return weight @ js.eigenmodes(_moved(_ELLIPSOID, _NEIGHBORS, points), 6).values
-
-    check_derivative(total, _ELLIPSOID.points, step=1e-4)  # one of them under jit
-
-
-def test_derivative_of_simple_functions():
     probe = jnp.asarray(np.random.default_rng(1).normal(size=(_ELLIPSOID.n, 4)))
 
     def observed(points):
-        functions = js.eigenmodes(_moved(_ELLIPSOID, _NEIGHBORS, points), 4).functions
-        return jnp.sum(probe * functions) + jnp.sum(functions**3)
+        modes = js.eigenmodes(_moved(_ELLIPSOID, _NEIGHBORS, points), 6)
+        functions = modes.functions[:, :4]
+        return jnp.stack(
+            [weight @ modes.values, jnp.sum(probe * functions) + jnp.sum(functions**3)]
+        )
 
-    check(observed, _ELLIPSOID.points)
+    check_derivative(observed, _ELLIPSOID.points, step=1e-4)
 
 
-@pytest.fixture(scope="module")
-def jittered():
+def test_derivatives_of_what_belongs_to_a_group():
+    """Symmetric functions of its values, and the projection on its space, which turns smoothly.
+
+    The modes in it need not. In a factor for each row, as the operator moves with the points above.
+    """
     cloud = jittered_sphere(500)
-    return cloud, js.choose_neighbors(cloud, method=_METHOD)
-
-
-def test_derivative_of_symmetric_functions_of_a_group(jittered):
-    cloud, neighbors = jittered
-
-    def symmetric(points):
-        operator = _moved(cloud, neighbors, points)
-        values = js.eigenmodes(operator, 9, degenerate=0.1).values
-        return values[1:4].sum() + jnp.prod(values[4:9]) ** 0.2 + jnp.sum(values[4:9] ** 2)
-
-    check(symmetric, cloud.points)
-
-
-def test_derivative_of_the_projection_on_a_group(jittered):
-    """The space of a group turns smoothly, although the modes in it need not."""
-    cloud, neighbors = jittered
+    operator = js.laplace_beltrami(cloud, method=_METHOD)
     field = jnp.exp(cloud.points @ jnp.array([1.0, 2.0, 1.5]))
 
-    def part(points):
-        modes = js.eigenmodes(_moved(cloud, neighbors, points), 4, degenerate=0.1)
-        return jnp.sum((modes.functions[:, 1:4].T @ field / cloud.n) ** 2)
+    def observed(noise):
+        modes = js.eigenmodes(operator.scaled(1 + noise), 9, degenerate=0.1)
+        values, functions = modes.values, modes.functions[:, 1:4]
+        symmetric = values[1:4].sum() + jnp.prod(values[4:9]) ** 0.2 + jnp.sum(values[4:9] ** 2)
+        return jnp.stack([symmetric, jnp.sum((functions.T @ field / cloud.n) ** 2)])
 
-    check(part, cloud.points)
+    check_derivative(observed, jnp.zeros(cloud.n), step=1e-3)
 
 
 @pytest.mark.core
@@ -197,7 +175,7 @@ def test_exactly_equal_values():
 
 def test_derivative_in_the_conditions():
     cloud = js.graph(lambda x, y: 0.2 * x * y, (16, 18))
-    operator = js.laplace_beltrami(cloud)
+    operator = js.laplace_beltrami(cloud, method=js.GFDM(degree=2))
     closure = js.close(cloud, [js.robin(cloud.boundary, 0.0, a=1.0, b=0.5)])
 
     def value(weights):
@@ -205,7 +183,7 @@ def test_derivative_in_the_conditions():
         modes = js.eigenmodes(operator, 2, conditions=conditions)
         return modes.values[0] + jnp.mean(modes.functions[:, 1] ** 4)
 
-    check(value, closure.weights)
+    check_derivative(value, closure.weights, step=1e-4)
 
 
 def test_second_derivatives_are_refused():
@@ -220,7 +198,7 @@ def test_second_derivatives_are_refused():
 
 
 def test_under_jit_and_vmap():
-    operator = laplacian(js.sphere(400), 2)
+    operator = laplacian(500, 2)
     modes = js.eigenmodes(operator, 4)
     traced = jax.jit(lambda o: js.eigenmodes(o, 4))(operator)
     np.testing.assert_allclose(traced.values, modes.values, atol=1e-10)
@@ -241,7 +219,7 @@ def test_no_full_matrix_in_the_derivative():
 
 
 def test_single_precision():
-    operator = laplacian(js.sphere(600), 2)
+    operator = laplacian(500, 2)
     single = jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == float else a, operator)
     modes = js.eigenmodes(single, 4)
     assert modes.values.dtype == modes.functions.dtype == jnp.float32
@@ -250,7 +228,7 @@ def test_single_precision():
 
 def test_multigrid_gives_the_same(monkeypatch):
     pytest.importorskip("pyamg")
-    operator = laplacian(js.sphere(600), 2)
+    operator = laplacian(500, 2)
     probe = jnp.asarray(np.random.default_rng(0).normal(size=operator.n))
 
     def observed(scale):
@@ -266,11 +244,11 @@ def test_multigrid_gives_the_same(monkeypatch):
 
 
 def test_misuse():
-    cloud = js.sphere(400)
-    operator = laplacian(cloud, 2)
+    cloud = js.sphere(500)
+    operator = laplacian(cloud.n, 2)
     with pytest.raises(ValueError, match=r"not from \(\) to \(3,\) components"):
         js.eigenmodes(js.surface_gradient(cloud), 3)
-    with pytest.raises(ValueError, match="k = 0 modes, between 1 and n / 2 = 200"):
+    with pytest.raises(ValueError, match="k = 0 modes, between 1 and n / 2 = 250"):
         js.eigenmodes(operator, 0)
     with pytest.raises(ValueError, match="began at value 2 and has not ended"):
         js.eigenmodes(operator, 4, degenerate=0.9)

@@ -129,7 +129,7 @@ POINTWISE = {
     "partial_derivative": (
         lambda p: js.partial_derivative(p.cloud.points[:, :2], (2, 0))(p.u),
         UNEVEN[1:],
-        1e-11,
+        1e-10,
     ),
     "mean_curvature": (lambda p: js.mean_curvature(p.cloud, **p.given), UNEVEN[:1], 1e-12),
     "gauss_curvature": (lambda p: js.gauss_curvature(p.cloud, **p.given), UNEVEN[:1], 1e-12),

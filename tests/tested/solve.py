@@ -38,10 +38,9 @@ TESTED = {
         "value": "test_eigen.py::test_groups_of_the_sphere, "
         "test_solve_forms.py::test_modes_with_images",
         "gradient": {
-            "weights": "test_eigen.py::test_derivative_of_simple_values, "
-            "test_eigen.py::test_derivative_of_simple_functions",
+            "weights": "test_eigen.py::test_derivatives_of_what_belongs_to_a_group",
             "conditions": "test_eigen.py::test_derivative_in_the_conditions",
-            "points": "test_eigen.py::test_derivative_of_simple_values",
+            "points": "test_eigen.py::test_derivatives_of_simple_modes",
             "normals": "test_solve_forms.py::test_gradient_of_values_in_normals",
         },
         "jit": "test_eigen.py::test_under_jit_and_vmap, "

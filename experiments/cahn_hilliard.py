@@ -64,7 +64,7 @@ def _growth(problem, cloud, setting) -> list[Row]:
     """A mode that grows, from a size at which its square is of no account."""
     end, tiny = 0.05, 1e-5
     eigenvalue, shape = mode(4, 2, cloud.points)
-    rate = -eigenvalue * (3 * _MEAN**2 - 1 + problem.width**2 * eigenvalue)
+    rate = -eigenvalue * (3 * _MEAN**2 - 1 + float(problem.width) ** 2 * eigenvalue)
     start = jnp.asarray(_MEAN + tiny * shape)
     u = js.integrate(problem, start, t1=end, dt0=end / 50, solver=js.IMEX(order=3)).ys[-1]
     seen = float(np.log(shape @ (np.asarray(u) - _MEAN) / (tiny * (shape @ shape))) / end)

@@ -81,7 +81,7 @@ def torus_values(degree: int, count: int = _COUNT) -> Float[np.ndarray, " count"
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    n = 4_000 if quick else 10_000
+    n = 5_000 if quick else 10_000
     shapes = [
         ("sphere", js.sphere(n), sphere_values(), 0.0, 1e-4),
         ("ellipsoid", js.ellipsoid(n, _AXES), *_converged(ellipsoid_values, 12, 16), 1e-3),

@@ -36,7 +36,7 @@ _VIEW = (0.3, 0.2, 1.0)
 def run(quick: bool, out: Path) -> list[Row]:
     sizes, orders = ([2_000, 4_000], [4]) if quick else ([2_000, 4_000, 8_000, 16_000], [2, 4])
     rows = _standing(sizes, orders)
-    return rows if quick else rows + _drop(10_000, out)
+    return rows if quick else rows + _drop(out)
 
 
 def _standing(sizes: list[int], orders: list[int]) -> list[Row]:
@@ -67,8 +67,8 @@ def _standing(sizes: list[int], orders: list[int]) -> list[Row]:
     return rows
 
 
-def _drop(n: int, out: Path) -> list[Row]:
-    scan, method = data.armadillo(n), js.DCPSE(order=2)
+def _drop(out: Path) -> list[Row]:
+    scan, method = data.armadillo(10_000), js.DCPSE(order=2)
     size = float(np.ptp(np.asarray(scan.points), axis=0).max())
     cloud = js.PointCloud(scan.points / size, scan.normals)
     laplacian = js.laplace_beltrami(cloud, method=method)

@@ -306,7 +306,8 @@ def _paths(points, neighbors, indices, mask, sources) -> Float[Array, " n"]:
     """Length of the shortest path from a source along neighbours; that there is one is checked."""
     concrete = is_concrete(points)
     row, slot = np.nonzero(mask & (indices != np.arange(len(indices))[:, None]))
-    column = indices[row, slot]
+    # SciPy 1.14 takes no wider index.
+    row, column = row.astype(np.int32), indices[row, slot].astype(np.int32)
     length = np.ones(len(row))
     if concrete:
         x = np.asarray(points, float)

@@ -101,37 +101,52 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     return stencil
 
 
-@eqx.filter_jit
 def stencil_weights(
     cloud, neighbors, method, target, rows=None
 ) -> tuple[Float[Array, "k *c r"], Diagnostics]:
-    """Weights `(k, *components, r)` and diagnostics of all stencils, or of those of some rows."""
+    """Weights `(k, *components, r)` and diagnostics of all stencils, or of those of some rows.
+
+    Three programs. The one in the middle takes long to compile and knows nothing of the number of
+    points but a rounded number of blocks, so that clouds of other sizes share it.
+    """
     rows = jnp.arange(cloud.n) if rows is None else rows
-    size = min(method.batch_size, len(rows))
-    place = in_blocks(rows, size)
+    found = _weights_of_blocks(
+        _in_blocks(cloud, neighbors, rows, method.batch_size), method, target
+    )
+    return _out_of_blocks(found, len(rows))
+
+
+@eqx.filter_jit
+def _in_blocks(cloud, neighbors, rows, size: int):
+    """Positions and normals of the neighbours of some rows, mask and radius, in blocks."""
     slots = in_blocks(neighbors.indices.T, size)
-    radius = neighbors.radius
     # One coordinate at a time: one gather for all of them is slower.
-    offsets = [
-        x - x0[:, None] for x, x0 in zip(*(_columns(cloud.points, i) for i in (slots, place)))
-    ]
-    normals = _columns(cloud.normals, slots)
-    mask = in_blocks(neighbors.mask.T, size)
-    radius = None if radius is None else jnp.broadcast_to(radius, (cloud.n,))[place]
+    points, normals = (
+        [column.at[slots].get(mode="promise_in_bounds") for column in vectors.T]
+        for vectors in (cloud.points, cloud.normals)
+    )
+    radius = neighbors.radius
+    if radius is not None:
+        radius = jnp.broadcast_to(radius, (cloud.n,))[in_blocks(rows, size)]
+    return points, normals, in_blocks(neighbors.mask.T, size), radius
 
+
+@eqx.filter_jit
+def _weights_of_blocks(blocks, method, target):
     def weights_of(block):
-        offsets, normals, mask, radius = block
-        offsets, normals = (jnp.stack(columns, axis=1) for columns in (offsets, normals))
-        return method.weights(Neighborhood(offsets, normals, mask, radius), target)
+        points, normals, mask, radius = block
+        # The point itself stands in slot 0.
+        offsets = jnp.stack([x - x[0] for x in points], axis=1)
+        around = Neighborhood(offsets, jnp.stack(normals, axis=1), mask, radius)
+        return method.weights(around, target)
 
-    found = blockwise(weights_of, (offsets, normals, mask, radius))
-    weights, diagnostics = jax.tree.map(lambda a: out_of_blocks(a, len(rows)), found)
+    return blockwise(weights_of, blocks)
+
+
+@eqx.filter_jit
+def _out_of_blocks(found, count: int):
+    weights, diagnostics = jax.tree.map(lambda a: out_of_blocks(a, count), found)
     return jnp.moveaxis(weights, -2, 0), diagnostics
-
-
-def _columns(vectors, slots):
-    """Coordinates of the points named by `slots`."""
-    return [column.at[slots].get(mode="promise_in_bounds") for column in vectors.T]
 
 
 # --- neighbourhoods ------------------------------------------------------------------------

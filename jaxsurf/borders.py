@@ -210,7 +210,8 @@ def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
     """The points marked in `cloud.boundary`, put in order along the border.
 
     Every border point is linked to its nearest one, and to the nearest one on the other side of
-    it; or the border edges of a mesh say how.
+    it; one that others pass over, as the tip of a sharp corner, is put between the two where the
+    way over it is least longer. Or the border edges of a mesh say how.
 
     Args:
         cloud: n points with `boundary`; concrete.
@@ -336,6 +337,14 @@ def _links(points, names) -> list[list[int]]:
     wanted = {(i, int(j)) for i, j in enumerate(near[:, 0])}
     wanted |= {(i, int(j)) for i, j in enumerate(second) if j >= 0}
     pairs = {(min(p), max(p)) for p in wanted}
+    partners: list[set[int]] = [set() for _ in names]
+    for i, j in pairs:
+        partners[i].add(j)
+        partners[j].add(i)
+    # Around the tip of a sharp corner, the two beside it are no neighbours, near as they are.
+    for near_by in partners:
+        if len(near_by) == 2 and all(len(partners[j]) > 2 for j in near_by):
+            pairs.discard((min(near_by), max(near_by)))
     squared = np.array([np.sum((points[i] - points[j]) ** 2) for i, j in pairs])
     length = dict(zip(pairs, distance_key(squared).tolist()))
     links: list[list[int]] = [[] for _ in names]
@@ -345,10 +354,25 @@ def _links(points, names) -> list[list[int]]:
         if len(links[i]) < 2 and len(links[j]) < 2:
             links[i].append(j)
             links[j].append(i)
-    lone = [i for i, near_by in enumerate(links) if not near_by]
-    if lone:
-        raise ValueError(f"border point {names[lone[0]]} has no neighbour along the border")
+    far = _FAR * np.median(distance[:, 0])
+    for i in [i for i, linked in enumerate(links) if not linked]:
+        if not _insert(i, near[i][distance[i] < far], points, links):
+            raise ValueError(f"border point {names[i]} has no neighbour along the border")
     return links
+
+
+def _insert(i, near, points, links) -> bool:
+    """Take the way over point i where that is least longer: the tip of a sharp corner, say."""
+    ways = sorted({(min(a, b), max(a, b)) for a in near.tolist() for b in links[a]})
+    if not ways:
+        return False
+    a, b = np.transpose(ways)
+    length = lambda p, q: np.linalg.norm(points[p] - points[q], axis=-1)
+    longer = length(a, i) + length(i, b) - length(a, b)
+    a, b = ways[np.argmin(distance_key(np.maximum(longer, 0)))]
+    links[a][links[a].index(b)] = links[b][links[b].index(a)] = i
+    links[i] += [a, b]
+    return True
 
 
 def _paths(links: list[list[int]]) -> list[tuple[np.ndarray, bool]]:

@@ -646,6 +646,28 @@ def test_borders_are_detected(make):
     assert not js.detect_border(js.sphere(700)).any()
 
 
+@pytest.mark.core
+@pytest.mark.parametrize("degrees", [35, 50, 58])
+def test_the_tip_of_a_sharp_corner_lies_on_the_border(degrees):
+    """The points beside the tip are nearer to each other than to it."""
+    half, m = np.radians(degrees / 2), 12
+    points, on_border = [(0.0, 0.0, 0.0)], [True]
+    for r in range(1, m + 1):
+        count = max(round(2 * half * r), 1)
+        for i, phi in enumerate(np.linspace(-half, half, count + 1)):
+            points.append((r * np.cos(phi), r * np.sin(phi), 0.0))
+            on_border.append(r == m or i in (0, count))
+    n = len(points)
+    cloud = js.PointCloud(np.array(points), np.tile([0.0, 0, 1], (n, 1)), boundary=on_border)
+    border = js.find_border(cloud)
+    path = np.asarray(border.points)
+    assert sorted(path) == np.flatnonzero(on_border).tolist()
+    step = np.linalg.norm(np.diff(np.array(points)[[*path, path[0]]], axis=0), axis=1)
+    assert step.max() < 1.2
+    ends = {0, *(np.flatnonzero(on_border)[[-1]]), n - 1 - round(2 * half * m)}
+    assert set(path[border.corners]) == ends
+
+
 def test_conormals_of_a_mesh():
     # A fan around the pole of the unit sphere.
     rings, count = 6, 24

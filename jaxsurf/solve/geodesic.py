@@ -105,8 +105,9 @@ def geodesic_distance(
     near, owners = _around(indices, sources)
     with jax.ensure_compile_time_eval():  # of the lists alone, also where points are traced
         share = _shares(mask).astype(cloud.points.dtype)
-        preconditioner = _preconditioner(indices, share, near)
-        known = jax.device_put((share, near, owners, sources.astype(np.int32)))
+        fixed = np.isin(np.arange(cloud.n), near)
+        preconditioner = _preconditioner(indices, share, fixed)
+        known = jax.device_put((share, fixed, near, owners, sources.astype(np.int32)))
     laplacian = laplace_beltrami(cloud, neighbors, method=method)
     gradient = surface_gradient(cloud, neighbors, method=method)
     scale = np.asarray(smoothing, cloud.points.dtype)
@@ -119,7 +120,7 @@ def geodesic_distance(
 @eqx.filter_jit
 def _distances(points, normals, neighbors, plain, path, known, preconditioner, smoothing, rtol):
     """All that is done on the device, in one program; rtol is static."""
-    share, near, owners, sources = known
+    share, fixed, near, owners, sources = known
     indices = neighbors.indices.T
     spacing = smoothing * _spacing(points, neighbors)
     laplacian, gradient = plain
@@ -139,8 +140,9 @@ def _distances(points, normals, neighbors, plain, path, known, preconditioner, s
     replaced = mixed & (jnp.sum(others, axis=0) > 0)
     from_others = _unit(Stencil(indices, others)(direction))
     direction = jnp.where(replaced[:, None], from_others, direction).at[near].set(away)
+    value = jnp.zeros_like(path).at[near].set(distance)
     return _integrate(
-        points, normals, indices, share, direction, near, distance, preconditioner, rtol
+        points, normals, indices, share, direction, fixed, value, preconditioner, rtol
     )
 
 
@@ -225,39 +227,31 @@ def _shares(mask) -> Float[np.ndarray, "k n"]:
     return share / np.sum(share, axis=0)
 
 
-def _differences(indices, share, near) -> Stencil:
-    """Value less the mean of the others, between free points; the identity next to the sources."""
-    xp = jnp if isinstance(share, jax.core.Tracer) else np
-    fixed = xp.zeros(share.shape[1], bool)
-    if xp is np:
-        fixed[near] = True
-    else:
-        fixed = fixed.at[near].set(True)
-    weights = xp.where(fixed | fixed[indices], 0, -share)
-    weights = xp.concatenate([xp.ones_like(weights[:1]), weights[1:]])
-    return Stencil(indices, weights)
+def _differences(indices, share, fixed) -> Stencil:
+    """Value less the mean of the others, between free points; the identity where it is known."""
+    own = np.arange(len(share))[:, None] == 0
+    return Stencil(indices, own - share * ~(fixed | fixed[indices]))
 
 
-def _preconditioner(indices, share, near) -> AbstractPreconditioner:
-    operator = _differences(np.ascontiguousarray(indices.T), share, near)
+def _preconditioner(indices, share, fixed) -> AbstractPreconditioner:
+    operator = _differences(np.ascontiguousarray(indices.T), share, fixed)
     return jax.device_put(multigrid(operator))
 
 
-def _integrate(x, normals, indices, share, direction, near, distance, preconditioner, rtol):
+def _integrate(x, normals, indices, share, direction, fixed, value, preconditioner, rtol):
     """The field whose differences fit the directions and which has given values near sources."""
-    fixed = jnp.zeros_like(x[:, 0]).at[near].set(distance)
 
     def add_slot(total, slot):
         j, w = slot
         chord = x[j] - x
         step = jnp.sum(chord * (direction + direction[j]), axis=1) / 2
-        return total - w * (_bent(chord, normals[j] - normals) * step - fixed[j]), None
+        return total - w * (_bent(chord, normals[j] - normals) * step - value[j]), None
 
-    rhs, _ = jax.lax.scan(add_slot, jnp.zeros_like(fixed), (indices, share))
+    rhs, _ = jax.lax.scan(add_slot, jnp.zeros_like(value), (indices, share))
     # The layout's own indices, which are the same, need no comparison.
-    operator = _differences(preconditioner.incoming.indices, share, near)
-    free = solve(operator, rhs.at[near].set(0), preconditioner=preconditioner, rtol=rtol).value
-    return free + fixed
+    operator = _differences(preconditioner.incoming.indices, share, fixed)
+    free = solve(operator, jnp.where(fixed, 0, rhs), preconditioner=preconditioner, rtol=rtol)
+    return free.value + value
 
 
 def _bent(chord, turn):

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from .arguments import instance, is_concrete
 from .arguments import mask as checked_mask
 from .cloud import PointCloud
+from .compiling import sized_jit
 from .neighbors import Neighbors, Rows, find_neighbors, nearest_of
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood
@@ -131,7 +132,7 @@ def _in_blocks(cloud, neighbors, rows, size: int):
     return points, normals, in_blocks(neighbors.mask.T, size), radius
 
 
-@eqx.filter_jit
+@sized_jit
 def _weights_of_blocks(blocks, method, target):
     def weights_of(block):
         points, normals, mask, radius = block

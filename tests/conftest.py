@@ -3,8 +3,8 @@
 Of the cache environment variables tell, so that the commands that tests start have it too. Float64
 is not among them: those commands must ask for it themselves.
 
-Most of the time of a test is compilation, of programs that run for milliseconds. So they are not
-optimised here; the commands that tests start (experiments, demo) compile as users do.
+Most of the time of a test is compilation, of programs that run for milliseconds. So they are
+optimised little here; the commands that tests start (experiments, demo) compile as users do.
 """
 
 import importlib.util
@@ -17,7 +17,8 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # what is loaded from it was tuned: no news
 os.environ.setdefault("MPLBACKEND", "Agg")
 _as_users = dict(os.environ)
-os.environ["XLA_FLAGS"] = f"--xla_backend_optimization_level=0 {os.environ.get('XLA_FLAGS', '')}"
+_quick = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
+os.environ["XLA_FLAGS"] = f"{_quick} {os.environ.get('XLA_FLAGS', '')}"
 
 import jax
 import pytest

@@ -9,6 +9,8 @@ import numpy as np
 import jaxsurf as js
 
 METHODS = [js.DCPSE(order=2), js.DCPSE(order=4), js.GFDM(degree=2), js.GFDM(degree=4)]
+# One of each kind, for what does not hang on the order.
+KINDS = [js.DCPSE(order=2), js.GFDM(degree=4)]
 
 
 _COUNTS: list[list[str]] = []
@@ -67,20 +69,22 @@ def central_difference(f, x, direction, step=1e-5):
     return (4 * difference(step / 2) - difference(step)) / 3
 
 
-def check_derivative(f, x, *, seed=0, step=1e-5, rtol=1e-6):
+def check_derivative(f, x, **options):
     """As `check_derivatives` in one argument."""
-    check_derivatives(f, x, seed=seed, step=step, rtol=rtol)
+    check_derivatives(f, x, **options)
 
 
-def check_derivatives(f, *xs, seed=0, step=1e-5, rtol=1e-6):
+def check_derivatives(f, *xs, seed=0, step=1e-5, rtol=1e-6, compiled=True):
     """Forward and reverse derivative in each argument against central differences.
 
     Two programs are compiled, however many arguments there are and however many values f has: each
     value is checked on its own, and the forward program also gives those at the shifted arguments.
+    Or none if not `compiled`: then those that f is made of, which other tests share.
     """
     rng = np.random.default_rng(seed)
-    push = jax.jit(lambda xs, dots: jax.jvp(f, xs, dots))
-    pull = jax.jit(lambda xs, dots: jax.vjp(f, *xs)[1](dots))
+    program = jax.jit if compiled else lambda g: g
+    push = program(lambda xs, dots: jax.jvp(f, xs, dots))
+    pull = program(lambda xs, dots: jax.vjp(f, *xs)[1](dots))
     directions = [jnp.asarray(rng.normal(size=jnp.shape(x))) for x in xs]
     directions = [direction / jnp.linalg.norm(direction) for direction in directions]
     pulled = None

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import jaxsurf as js
 
 from .helpers import (
-    check_derivative,
+    check_derivatives,
     count_compilations,
     exponential,
     jittered_sphere,
@@ -82,6 +82,18 @@ def test_mapped(name):
     size = jnp.abs(expected).max()
     # What is compiled within is shared by all of these tests; under jit of its own, nothing is.
     np.testing.assert_allclose(jax.vmap(f)(scales), expected, atol=1e-10 * size)
+
+
+def test_under_jit():
+    """All in one program."""
+
+    def everything(points):
+        return {name: values(name, squeezed(points)) for name in (*OPERATORS, *CURVATURES)}
+
+    plain, found = everything(CLOUD.points), jax.jit(everything)(CLOUD.points)
+    for name, expected in plain.items():
+        size = float(jnp.abs(expected).max())
+        np.testing.assert_allclose(found[name], expected, atol=1e-10 * size, err_msg=name)
 
 
 # Largest errors in single precision, as shares of the largest value: 1e-7 amplified by 1 / h for
@@ -244,14 +256,15 @@ def test_gradients_of_diffusion_in_each_argument():
     """Scalar and tensor diffusivity, points, normals and field."""
     points = CLOUD.points * jnp.array([1.0, 1.2, 1.5])
 
-    def total(points=points, normals=CLOUD.normals, d=1.5 + U, u=U, tensor=TENSOR):
+    def total(points, normals, d, scale, u):
         cloud = js.PointCloud(points, normals)
+        tensor = TENSOR * scale[:, None, None]
         parts = [js.diffusion(cloud, coefficient, **ARGS)(u) for coefficient in (d, tensor)]
         return sum(jnp.sum(jnp.cos(jnp.arange(N)) * part) for part in parts) / 100
 
-    for name, x in (("points", points), ("normals", CLOUD.normals), ("d", 1.5 + U), ("u", U)):
-        check_derivative(lambda x, name=name: total(**{name: x}), x, step=1e-4)
-    check_derivative(lambda s: total(tensor=TENSOR * s[:, None, None]), 1 + 0 * U, step=1e-4)
+    check_derivatives(
+        total, points, CLOUD.normals, 1.5 + U, 1 + 0 * U, U, step=1e-4, compiled=False
+    )
 
 
 def test_gradients_on_plane_curves():
@@ -260,7 +273,7 @@ def test_gradients_on_plane_curves():
     circle = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
     args = {"neighbors": js.find_neighbors(circle, k=9), "method": METHOD}
 
-    def total(points, u=jnp.sin(3 * angle)):
+    def total(points, u):
         normals = points / jnp.array([1.0, 1.5]) ** 2
         cloud = js.PointCloud(points, normals / jnp.linalg.norm(normals, axis=1, keepdims=True))
         gradient = js.surface_gradient(cloud, **args)(u)
@@ -273,8 +286,9 @@ def test_gradients_on_plane_curves():
         ]
         return sum(jnp.sum(jnp.cos(jnp.arange(60)) * part) for part in parts) / 100
 
-    check_derivative(total, circle * jnp.array([1.0, 1.5]), step=1e-4)
-    check_derivative(functools.partial(total, circle * jnp.array([1.0, 1.5])), jnp.sin(3 * angle))
+    check_derivatives(
+        total, circle * jnp.array([1.0, 1.5]), jnp.sin(3 * angle), step=1e-4, compiled=False
+    )
 
 
 class NearestPair(js.AbstractMethod):

@@ -14,7 +14,7 @@ def _operator(value: str, *arguments: str, **others: str) -> dict:
     return {
         "value": value,
         "gradient": dict.fromkeys(arguments, gradient) | others,
-        "jit": gradient,
+        "jit": _FORMS + "test_under_jit",
         "vmap": _FORMS + "test_mapped",
         "float32": _FORMS + "test_single_precision",
         "bad input": "malformed",
@@ -169,7 +169,7 @@ TESTED = {
     "Composition": {
         "value": "test_operators.py::test_matrix_transpose_and_lineax_agree",
         "gradient": {"field": "test_gradients.py::test_other_operators_and_curvature"},
-        "jit": "test_gradients.py::test_other_operators_and_curvature",
+        "jit": _FORMS + "test_under_jit",
         "vmap": _FORMS + "test_mapped",
         "float32": _FORMS + "test_single_precision",
         "bad input": "malformed",
@@ -210,7 +210,7 @@ TESTED = {
     "AbstractOperator": {
         "value": "test_operators.py::test_matrix_transpose_and_lineax_agree",
         "gradient": {"field": "test_gradients.py::test_other_operators_and_curvature"},
-        "jit": "test_gradients.py::test_other_operators_and_curvature",
+        "jit": _FORMS + "test_under_jit",
         "vmap": _FORMS + "test_mapped",
         "float32": _FORMS + "test_single_precision",
         "bad input": "malformed",

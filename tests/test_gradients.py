@@ -9,7 +9,7 @@ import pytest
 
 import jaxsurf as js
 
-from .helpers import METHODS, check_derivatives, jittered_sphere, label
+from .helpers import KINDS, METHODS, check_derivatives, jittered_sphere, label
 
 CLOUD = jittered_sphere(300, seed=1)
 FIELD = jnp.sin(CLOUD.points @ jnp.array([1.0, 2.0, 1.5]))
@@ -17,6 +17,7 @@ VECTOR = jnp.stack([FIELD, FIELD**2, jnp.cos(FIELD)], axis=1)
 # The programs that operators are made of are shared by these tests; under jit nothing would be.
 check_derivative = functools.partial(check_derivatives, compiled=False)
 each_method = pytest.mark.parametrize("method", METHODS, ids=label)
+each_kind = pytest.mark.parametrize("method", KINDS, ids=label)
 
 
 def smooth(values):
@@ -69,7 +70,7 @@ def test_other_operators_and_curvature():
         )
 
 
-@each_method
+@each_kind
 def test_normals_alone(method):
     neighbors = js.choose_neighbors(CLOUD, method=method)
 
@@ -98,7 +99,7 @@ def test_field_and_coefficients():
     check_derivative(lambda s: smooth(laplacian.scaled(s).transpose()(FIELD)), 1.0 + FIELD**2)
 
 
-@each_method
+@each_kind
 def test_a_neighbor_crosses_the_edge_of_the_support(method):
     """A search by radius: the lists change within the difference, the weights must not jump."""
     radius = 0.62 if label(method).endswith("4") else 0.5
@@ -123,7 +124,7 @@ def test_a_neighbor_crosses_the_edge_of_the_support(method):
     np.testing.assert_allclose(derivative, difference, rtol=1e-6)
 
 
-@each_method
+@each_kind
 def test_the_nearest_change(method):
     """The k nearest: a point that enters the list has no weight yet."""
     k = method.neighbor_count(3)

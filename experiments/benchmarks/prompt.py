@@ -56,12 +56,8 @@ def stretched(cloud: js.PointCloud) -> js.PointCloud:
     return js.PointCloud(cloud.points * factors, normals, boundary=cloud.boundary)
 
 
-def _phi(x):
-    return jnp.sum(x**4) - 1
-
-
-def _egg(x):
-    return jnp.sum(x**4) + 0.2 * x[0] * x[1] - 1
+def _egg(a):
+    return lambda x: jnp.sum(x**4) + a * x[0] * x[1] - 1
 
 
 def _saddle(x, y):
@@ -90,7 +86,8 @@ class Made:
             "problem": lambda: js.AdvectionDiffusionReaction(
                 self.laplacian, diffusivity=self.number
             ),
-            "capacity": lambda: js.allocate(self.cloud.points, 0.15),
+            # Once, with room for all that is searched.
+            "capacity": lambda: js.allocate(js.sphere(N).points, 0.2),
             "spin": lambda: jnp.cross(jnp.array([0.0, 0.0, 1.0]), self.cloud.points),
         }[name]()
         self.__dict__[name] = value
@@ -105,7 +102,7 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
         "closed",
         "",
         lambda m: js.level_set(
-            _phi if m.number == 1 else _egg, n=N, bounds=((-1.5,) * 3, (1.6,) * 3)
+            _egg(m.number - 1), n=N, bounds=((-1.5,) * 3, (1.6,) * 3)
         ).points,
     ),
     "estimate_normals": ("closed", "", lambda m: js.estimate_normals(m.cloud.points)),

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxsurf as js
+from jaxsurf.compiling import sized_jit
 
 from .helpers import (
     check_derivatives,
@@ -197,6 +198,30 @@ def test_another_geometry_compiles_nothing():
     assert first[1] != second[1]  # so many were adapted
     # Lists of another width are copied to the device by a program that does nothing else.
     assert not set(names) - {"jit(stage)"}, names
+
+
+def test_another_number_of_points_shares_the_long_program():
+    """Only what gathers for it, and sorts its results, is compiled."""
+    clouds = [jittered_sphere(n) for n in (N - 17, N - 18)]
+    lists = [js.find_neighbors(cloud, k=24) for cloud in clouds]
+    js.laplace_beltrami(clouds[0], lists[0], method=METHOD)
+    with count_compilations() as names:
+        js.laplace_beltrami(clouds[1], lists[1], method=METHOD)
+    assert {"jit(_in_blocks)", "jit(_out_of_blocks)"} <= set(names), names
+    assert len(names) < 8 and "jit(_weights_of_blocks)" not in names, names
+
+
+def test_small_programs_are_the_same_in_every_form():
+    """What is compiled with fewer optimisations at the prompt, against jit, grad and vmap."""
+    program = sized_jit(lambda x, power, parts: x**power + parts["a"])
+    x, parts = jnp.linspace(0.1, 1, 7), {"a": jnp.ones(7), "b": None}
+    expected = np.asarray(x) ** 3 + 1
+    np.testing.assert_allclose(program(x, 3, parts), expected, rtol=1e-14)
+    np.testing.assert_allclose(jax.jit(lambda: program(x, 3, parts))(), expected, rtol=1e-14)
+    slope = jax.grad(lambda x: jnp.sum(program(x, 3, parts)))(x)
+    np.testing.assert_allclose(slope, 3 * np.asarray(x) ** 2, rtol=1e-14)
+    mapped = jax.vmap(lambda x: program(x, 3, {"a": 1.0}))(x)
+    np.testing.assert_allclose(mapped, expected, rtol=1e-14)
 
 
 @pytest.mark.parametrize("method", [js.GFDM(degree=p) for p in range(2, 7)], ids=str)

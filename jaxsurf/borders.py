@@ -332,19 +332,12 @@ def _links(points, names) -> list[list[int]]:
     near, distance = near[:, 1:], distance[:, 1:]
     first = d[:, 0] / distance[:, :1]
     cosine = np.einsum("nkd,nd->nk", d, first) / distance
-    other = (cosine < _ASIDE) & (distance < _FAR * np.median(distance[:, 0]))
+    close_by = distance < _FAR * np.median(distance[:, 0])
+    other = (cosine < _ASIDE) & close_by
     second = np.where(other.any(axis=1), near[np.arange(len(near)), np.argmax(other, axis=1)], -1)
     wanted = {(i, int(j)) for i, j in enumerate(near[:, 0])}
     wanted |= {(i, int(j)) for i, j in enumerate(second) if j >= 0}
-    pairs = {(min(p), max(p)) for p in wanted}
-    partners: list[set[int]] = [set() for _ in names]
-    for i, j in pairs:
-        partners[i].add(j)
-        partners[j].add(i)
-    # Around the tip of a sharp corner, the two beside it are no neighbours, near as they are.
-    for near_by in partners:
-        if len(near_by) == 2 and all(len(partners[j]) > 2 for j in near_by):
-            pairs.discard((min(near_by), max(near_by)))
+    pairs = _not_past_tips({(min(p), max(p)) for p in wanted}, len(names))
     squared = np.array([np.sum((points[i] - points[j]) ** 2) for i, j in pairs])
     length = dict(zip(pairs, distance_key(squared).tolist()))
     links: list[list[int]] = [[] for _ in names]
@@ -354,11 +347,24 @@ def _links(points, names) -> list[list[int]]:
         if len(links[i]) < 2 and len(links[j]) < 2:
             links[i].append(j)
             links[j].append(i)
-    far = _FAR * np.median(distance[:, 0])
     for i in [i for i, linked in enumerate(links) if not linked]:
-        if not _insert(i, near[i][distance[i] < far], points, links):
+        if not _insert(i, near[i][close_by[i]], points, links):
             raise ValueError(f"border point {names[i]} has no neighbour along the border")
     return links
+
+
+def _not_past_tips(pairs: set[tuple[int, int]], m: int) -> set[tuple[int, int]]:
+    """Without links past the tip of a sharp corner, whose two neighbours are near each other."""
+    partners: list[set[int]] = [set() for _ in range(m)]
+    for i, j in pairs:
+        partners[i].add(j)
+        partners[j].add(i)
+    past = {
+        (min(beside), max(beside))
+        for beside in partners
+        if len(beside) == 2 and all(len(partners[j]) > 2 for j in beside)
+    }
+    return pairs - past
 
 
 def _insert(i, near, points, links) -> bool:

@@ -65,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _usual(surface: str | None) -> str:
     """GFDM(4), but on scans coarser than their texture heat may grow with it, as on an armadillo.
 
-    There order 4 gains nothing over 2 and takes ten times as long.
+    There order 4 gains nothing over 2 and takes several times as long.
     """
     return "gfdm4" if surface is None else "dcpse2"
 

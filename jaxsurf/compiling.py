@@ -10,7 +10,7 @@ import numpy as np
 
 from .arguments import is_concrete
 
-# Half the time to compile, and up to 1.4 times that to run.
+# Down to half the time to compile, and up to 1.4 times that to run.
 _QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 # Numbers given to a program, in all its arrays, below which it is small.
 _SMALL = 2_000_000

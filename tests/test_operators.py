@@ -19,7 +19,7 @@ each_method = pytest.mark.parametrize("method", METHODS, ids=label)
 each_kind = pytest.mark.parametrize("method", KINDS, ids=label)
 
 
-@each_kind
+@each_method
 def test_constants_are_annihilated(method):
     neighbors = js.choose_neighbors(CLOUD, method=method)
     one = jnp.ones(CLOUD.n)

@@ -111,14 +111,12 @@ def stencil_weights(
     points but a rounded number of blocks, so that clouds of other sizes share it.
     """
     rows = jnp.arange(cloud.n) if rows is None else rows
-    found = _weights_of_blocks(
-        _in_blocks(cloud, neighbors, rows, method.batch_size), method, target
-    )
-    return _out_of_blocks(found, len(rows))
+    blocks = blocks_of(cloud, neighbors, rows, method.batch_size)
+    return rows_of(_weights_of_blocks(blocks, method, target), len(rows))
 
 
-@eqx.filter_jit
-def _in_blocks(cloud, neighbors, rows, size: int):
+@sized_jit
+def blocks_of(cloud, neighbors, rows, size: int):
     """Positions and normals of the neighbours of some rows, mask and radius, in blocks."""
     slots = in_blocks(neighbors.indices.T, size)
     # One coordinate at a time: one gather for all of them is slower.
@@ -134,20 +132,22 @@ def _in_blocks(cloud, neighbors, rows, size: int):
 
 @sized_jit
 def _weights_of_blocks(blocks, method, target):
-    def weights_of(block):
-        points, normals, mask, radius = block
-        # The point itself stands in slot 0.
-        offsets = jnp.stack([x - x[0] for x in points], axis=1)
-        around = Neighborhood(offsets, jnp.stack(normals, axis=1), mask, radius)
-        return method.weights(around, target)
+    return blockwise(lambda block: method.weights(neighborhood(block), target), blocks)
 
-    return blockwise(weights_of, blocks)
+
+def neighborhood(block) -> Neighborhood:
+    """What the stencils of one of these blocks see."""
+    points, normals, mask, radius = block
+    # The point itself stands in slot 0.
+    offsets = jnp.stack([x - x[0] for x in points], axis=1)
+    return Neighborhood(offsets, jnp.stack(normals, axis=1), mask, radius)
 
 
 @eqx.filter_jit
-def _out_of_blocks(found, count: int):
-    weights, diagnostics = jax.tree.map(lambda a: out_of_blocks(a, count), found)
-    return jnp.moveaxis(weights, -2, 0), diagnostics
+def rows_of(found, count: int):
+    """Weights, with the slots first, and what else was found of the rows, out of their blocks."""
+    weights, others = jax.tree.map(lambda a: out_of_blocks(a, count), found)
+    return jnp.moveaxis(weights, -2, 0), others
 
 
 # --- neighbourhoods ------------------------------------------------------------------------

@@ -23,11 +23,11 @@ def sized_jit(f: Callable) -> Callable:
     optimisations; so does a jaxlib that does not know the options.
     """
 
-    @functools.wraps(f)
     def program(arrays, others, structure):
         leaves = [other if array is None else array for array, other in zip(arrays, others)]
         return f(*jax.tree.unflatten(structure, leaves))
 
+    program.__name__ = f.__name__
     compiled = functools.partial(jax.jit, program, static_argnums=(1, 2))
     thorough, quick = compiled(), compiled(compiler_options=_QUICK)
 

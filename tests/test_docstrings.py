@@ -12,11 +12,14 @@ import pytest
 
 import jaxsurf as js
 
+pytestmark = pytest.mark.slow
+
 MODULES = sorted(
     m.name for m in pkgutil.walk_packages(js.__path__, "jaxsurf.") if "__main__" not in m.name
 )
 
 
+@pytest.mark.core
 def test_every_public_name_has_an_example():
     public = {
         name: value

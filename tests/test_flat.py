@@ -8,6 +8,8 @@ import jaxsurf as js
 
 from .helpers import check_derivative, relative_error
 
+pytestmark = pytest.mark.slow
+
 
 def square(m, dim=2, seed=0):
     """A jittered grid on the unit square or cube."""

@@ -24,6 +24,8 @@ from .helpers import (
     relative_error,
 )
 
+pytestmark = pytest.mark.slow
+
 N, METHOD = 200, js.GFDM(degree=2)
 CLOUD = jittered_sphere(N)
 LISTS = js.find_neighbors(CLOUD, k=24)
@@ -85,6 +87,7 @@ def test_mapped(name):
     np.testing.assert_allclose(jax.vmap(f)(scales), expected, atol=1e-10 * size)
 
 
+@pytest.mark.core
 def test_under_jit():
     """All in one program."""
 
@@ -156,6 +159,7 @@ def test_precision_may_be_switched():
         assert relative_error(again, exact) < 1e-12, method
 
 
+@pytest.mark.core
 def test_the_second_call_compiles_nothing():
     """At the prompt: fields, batches, derivatives, transposes; another operator of these sizes."""
     other = js.find_neighbors(jittered_sphere(N, seed=5), k=24)
@@ -179,6 +183,7 @@ def test_the_second_call_compiles_nothing():
     assert not names, names
 
 
+@pytest.mark.core
 def test_another_geometry_compiles_nothing():
     """Nor another coefficient, radius, or number of points whose neighbourhoods are adapted."""
 
@@ -224,6 +229,7 @@ def test_small_programs_are_the_same_in_every_form():
     np.testing.assert_allclose(mapped, expected, rtol=1e-14)
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("method", [js.GFDM(degree=p) for p in range(2, 7)], ids=str)
 def test_every_polynomial_of_the_basis_is_exact(method):
     """On a plane, all monomials up to the degree: Laplacian and gradient."""
@@ -473,6 +479,7 @@ class _Flat(NearestPair):
         return w.at[0].set(0), diagnostics
 
 
+@pytest.mark.core
 def test_representations():
     marked = js.PointCloud(CLOUD.points, CLOUD.normals, boundary=np.arange(N) < 9)
     assert repr(CLOUD).startswith("PointCloud(200 points in 3-d, float64, spacing 0.")

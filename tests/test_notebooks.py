@@ -6,12 +6,15 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 _FOLDER = Path(__file__).parent.parent / "notebooks"
 _NOTEBOOKS = sorted(_FOLDER.glob("*.ipynb"))
 _MISSING = [name for name in ("nbclient", "ipykernel") if not importlib.util.find_spec(name)]
 _NEEDED = f"needs {', '.join(_MISSING)}: pip install 'jaxsurf[notebooks]'"
 
 
+@pytest.mark.core
 def test_there_are_notebooks():
     assert [path.name for path in _NOTEBOOKS] == ["patterns.ipynb", "quickstart.ipynb"]
 

@@ -11,6 +11,8 @@ import jaxsurf as js
 
 from .helpers import central_difference, check_derivatives, count_compilations
 
+pytestmark = pytest.mark.slow
+
 METHOD = js.DCPSE(order=2)
 GFDM = js.GFDM(degree=2)
 

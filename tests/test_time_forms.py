@@ -12,6 +12,8 @@ import jaxsurf as js
 from .helpers import check_derivatives, relative_error
 from .test_solve_forms import single
 
+pytestmark = pytest.mark.slow
+
 METHOD = js.GFDM(degree=2)
 CLOUD = js.sphere(200)
 LISTS = js.find_neighbors(CLOUD, k=24)

@@ -12,6 +12,8 @@ from jaxsurf.time.implicit import _IMEX, _SDIRK, _relative
 
 from .helpers import ring
 
+pytestmark = pytest.mark.slow
+
 # A circle, as stiff as 300 points on the sphere, of which the eigenvalues are known.
 ANGLES, LAPLACIAN, _ = ring(24)
 N, X, Z = len(ANGLES), jnp.cos(ANGLES), jnp.sin(ANGLES)
@@ -40,6 +42,7 @@ def trees(order):
         yield lambda b, c, A: b @ A @ c**2, 1 / 12
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("order, tableau", [*_IMEX.items(), *_SDIRK.items()])
 def test_tableaus_satisfy_the_order_conditions(order, tableau):
     """Also mixed ones (explicit and implicit matrices), and one order lower when embedded."""
@@ -119,6 +122,7 @@ def test_order(solver, exact):
     assert np.log2(errors[0] / errors[1]) > min(solver.scheme, 3) - 0.6
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("solver", [js.IMEX(order=3), js.SDIRK(order=3)], ids=["IMEX", "SDIRK"])
 def test_long_steps_damp_noise(solver):
     noise = jnp.asarray(np.random.default_rng(0).normal(size=N))
@@ -288,6 +292,7 @@ def test_newton_that_fails_shortens_the_step():
         js.integrate(one, u0, t1=10.0, dt0=10.0, solver=solver)
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("kind", [js.IMEX, js.SDIRK])
 def test_unknown_order(kind):
     with pytest.raises(ValueError, match="order = 7, there are"):

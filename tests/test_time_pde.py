@@ -12,6 +12,8 @@ import jaxsurf as js
 
 from .helpers import check_derivative, jittered_sphere, relative_error, ring
 
+pytestmark = pytest.mark.slow
+
 CLOUD = js.sphere(600)
 METHOD = js.DCPSE(order=4)
 NEIGHBORS = js.choose_neighbors(CLOUD, method=METHOD)
@@ -21,6 +23,7 @@ X, Y, Z = CLOUD.points.T
 TURN = jnp.cross(jnp.array([0.0, 0.0, 1.0]), CLOUD.points)  # one radian per unit of time
 
 
+@pytest.mark.core
 def test_two_species_with_their_own_diffusivities_and_a_reaction():
     """z decays with 2 D, xy with 6 D; the reaction turns the two species into each other."""
     u0 = jnp.stack([Z + X * Y, 0 * Z], axis=1)
@@ -177,6 +180,7 @@ def test_mass_to_the_order_of_the_method_and_to_roundoff(solver):
     assert drift[1] < 1e-14
 
 
+@pytest.mark.core
 def test_conditions():
     """Values that move with time on a band around the equator: z decays."""
     cloud = js.sphere(1_000)
@@ -223,6 +227,7 @@ def test_rates_are_differentiable_in_every_array():
     np.testing.assert_allclose(float(sum(products)), expected, rtol=1e-8)
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(
     "arguments, message",
     [

@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import dijkstra
 from ..arguments import instance, is_concrete, real
 from ..build import choose_neighbors
 from ..cloud import PointCloud
+from ..compiling import sized_jit
 from ..neighbors import Neighbors
 from ..operators import laplace_beltrami, surface_gradient
 from ..stencils.gfdm import GFDM
@@ -117,7 +118,7 @@ def geodesic_distance(
     )
 
 
-@eqx.filter_jit
+@sized_jit
 def _distances(points, normals, neighbors, plain, path, known, preconditioner, smoothing, rtol):
     """All that is done on the device, in one program; rtol is static."""
     share, fixed, near, owners, sources = known

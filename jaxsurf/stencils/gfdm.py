@@ -10,10 +10,9 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..frames import tangent_frames
-from .kernels import gaussian
-from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive, dot, with_center
+from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive, with_center
 from .moments import moment_solve
+from .plane import TangentPlane
 from .targets import AbstractTarget
 
 
@@ -69,24 +68,14 @@ class GFDM(AbstractMethod):
         return 256
 
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
-        offsets, mask = neighborhood.offsets, neighborhood.mask
-        dim = offsets.shape[1]
-        radius = neighborhood.support(dim - 1, self.support)
-        width = radius * (_width(self.degree) if self.width is None else self.width)
-
-        tangents = jnp.moveaxis(tangent_frames(neighborhood.normals[0].T), 0, -1)[:-1]
-        plane = jnp.stack([dot(offsets, t[None]) for t in tangents]) / width
-        w = gaussian(neighborhood.squared, width, radius, mask)
-        b = jnp.asarray(target.moments(dim - 1, 1, self.degree), offsets.dtype)
-        eta, condition, residual = moment_solve(plane, w, b, 1, self.degree)
-        eta = with_center(eta / width**target.order)
-        diagnostics = Diagnostics.of(neighborhood, condition, residual, radius, 0)
-        return target.assemble(eta, tangents), diagnostics
+        plane = TangentPlane.of(neighborhood, self.degree, width=self.width, support=self.support)
+        b = jnp.asarray(target.moments(len(plane.points), 1, self.degree), plane.points.dtype)
+        found = moment_solve(plane.points, plane.weights, b, 1, self.degree)
+        eta, condition, residual = found
+        eta = with_center(eta / plane.width**target.order)
+        diagnostics = Diagnostics.of(neighborhood, condition, residual, plane.radius, 0)
+        return target.assemble(eta, plane.tangents), diagnostics
 
 
 # Neighbours to look for on a surface, by degree; see `experiments` (stability study).
 _SURFACE_COUNT = {1: 16, 2: 36, 3: 42, 4: 60, 5: 66, 6: 90}
-
-
-def _width(degree: int) -> float:
-    return 0.36 if degree <= 2 else 0.315

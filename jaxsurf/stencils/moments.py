@@ -33,7 +33,7 @@ from .monomials import differentiation, monomial_rows, monomials, multi_indices,
 def moment_solve(
     x: Float[Array, "dim q *p"],
     w: Float[Array, "q *p"],
-    b: Float[Array, "m c"],
+    b: Float[Array, "m c *b"],
     low: int,
     high: int,
 ) -> tuple[Float[Array, "c q *p"], Float[Array, "*p"], Float[Array, "*p"]]:
@@ -42,7 +42,8 @@ def moment_solve(
     Args:
         x: coordinates of the points in units of the neighbourhood, so that they are of order 1.
         w: non-negative weights; points of weight zero do not take part.
-        b: moments wanted, for the multi-indices of degree `low` to `high`, graded.
+        b: moments wanted, for the multi-indices of degree `low` to `high`, graded; the same for
+            all points, `(m, c)`, or those of each.
         low: lowest degree of the basis, 0 or 1.
         high: highest degree of the basis.
 
@@ -50,35 +51,42 @@ def moment_solve(
         The weights $\eta$; an estimate (from below, from the Cholesky pivots) of the condition
         number of the equilibrated matrix; and the largest moment residual relative to b.
 
-    Differentiable: forward and reverse, in x and w, by the closed form; the two diagnostics
-    have derivative zero. b is taken as constant.
+    Differentiable: forward and reverse, in x, w and the b of each point, by the closed form; the
+    two diagnostics have derivative zero. A b for all points is taken as constant.
     """
     return _solve(x, w, b, low, high)[0]
 
 
 def _solve(x, w, b, low, high):
     """What `moment_solve` returns, and what its derivative needs of it."""
-    small = len(b) <= systems.SMALL
-    v: list[Array] | Array = monomial_rows(x, high) if small else monomials(x, high)
-    start = len(multi_indices(len(x), 0, low - 1))
-    b = b.astype(w.dtype).reshape(*b.shape, *(1,) * (w.ndim - 1))
+    v, start, gram, (solve, condition) = _system(x, w, low, high)
+    small = isinstance(v, list)
+    b = b.astype(w.dtype).reshape(*b.shape, *(1,) * (w.ndim + 1 - b.ndim))
     wanted = list(b) if small else jnp.broadcast_to(b, (*b.shape[:2], *w.shape[1:]))
-    solve, condition = systems.factor(gram := _gram(x, w, low, high))
     a = solve(wanted)
     s = systems.combine(a, v[start:])
     eta = w * s
     # The moments of eta are A a.
     found = systems.symmetric(gram, a)
     error = jnp.abs((jnp.stack(found) if small else found) - b)
-    residual = jnp.max(error, axis=(0, 1)) / jnp.max(jnp.abs(b))
+    residual = jnp.max(error, axis=(0, 1)) / jnp.max(jnp.abs(b), axis=(0, 1))
     return (eta, condition, residual), (v, start, solve, a, s)
+
+
+def _system(x, w, low, high):
+    """All monomials, the number of those below the basis, the Gram matrix and its solver."""
+    start = len(multi_indices(len(x), 0, low - 1))
+    small = len(multi_indices(len(x), low, high)) <= systems.SMALL
+    v: list[Array] | Array = monomial_rows(x, high) if small else monomials(x, high)
+    gram = _gram(x, w, low, high)
+    return v, start, gram, systems.factor(gram)
 
 
 @moment_solve.defjvp
 def _moment_solve_jvp(low, high, primals, tangents):
     # With s = V a:  d eta = dw s + w (dV a + V da),  A da = -(V^T (dw s + w dV a) + dV^T (w s)).
     x, w, b = primals
-    dx, dw, _ = tangents
+    dx, dw, db = tangents
     (eta, condition, residual), (v, start, solve, a, s) = _solve(x, w, b, low, high)
     # dV a is the gradient of the polynomial s along dx; dV^T g the same matrices transposed.
     axes = [(d[:, start:], dx_i) for d, dx_i in zip(differentiation(len(x), high), dx)]
@@ -87,8 +95,52 @@ def _moment_solve_jvp(low, high, primals, tangents):
     rhs = systems.moments(v[start:], g)
     for d, dx_i in axes:
         rhs = systems.add(rhs, systems.transform(d.T, systems.moments(v, eta * dx_i)))
+    if b.ndim > 2:
+        rhs = systems.add(rhs, [-row for row in db] if isinstance(rhs, list) else -db)
     d_eta = g - w * systems.combine(solve(rhs), v[start:])
     return (eta, condition, residual), (d_eta, jnp.zeros_like(condition), jnp.zeros_like(residual))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
+def polynomial_fit(
+    x: Float[Array, "dim q *p"],
+    w: Float[Array, "q *p"],
+    values: Float[Array, "c q *p"],
+    low: int,
+    high: int,
+) -> Float[Array, "m c *p"]:
+    r"""Coefficients a that minimise $\sum_q w_q (\sum_\gamma a_\gamma x_q^\gamma - z_q)^2$.
+
+    Args:
+        x, w, low, high: as for `moment_solve`, whose matrix A is that of the normal equations.
+        values: z, of c functions.
+
+    Differentiable: forward and reverse, in x, w and values, by the closed form.
+    """
+    return _fit(x, w, values, low, high)[0]
+
+
+def _fit(x, w, values, low, high):
+    v, start, _, (solve, _) = _system(x, w, low, high)
+    a = solve(systems.moments(v[start:], w * values))
+    return (jnp.stack(a) if isinstance(a, list) else a), (v, start, solve)
+
+
+@polynomial_fit.defjvp
+def _polynomial_fit_jvp(low, high, primals, tangents):
+    # With the residual e = z - V a:  A da = V^T (dw e + w (dz - dV a)) + dV^T (w e).
+    x, w, values = primals
+    dx, dw, dz = tangents
+    out, (v, start, solve) = _fit(x, w, values, low, high)
+    a = list(out) if isinstance(v, list) else out
+    left = values - systems.combine(a, v[start:])
+    axes = [(d[:, start:], dx_i) for d, dx_i in zip(differentiation(len(x), high), dx)]
+    slope = sum(systems.combine(systems.transform(d, a), v) * dx_i for d, dx_i in axes)
+    rhs = systems.moments(v[start:], dw * left + w * (dz - slope))
+    for d, dx_i in axes:
+        rhs = systems.add(rhs, systems.transform(d.T, systems.moments(v, w * left * dx_i)))
+    da = solve(rhs)
+    return out, (jnp.stack(da) if isinstance(v, list) else da)
 
 
 @functools.cache

@@ -67,6 +67,7 @@ EXPERIMENTS = {
         "poisson",
         "Study: Poisson on ellipsoid, torus and a surface of genus 2; scans; orders and steps",
     ),
+    "integrals": ("integrals", "Study: area, volume and integrals of curvature, by order"),
     "slopes": ("slopes", "Study: observed orders of the Laplacian on sphere, ellipsoid and torus"),
     "stability": (
         "stability",

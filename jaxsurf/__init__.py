@@ -24,6 +24,8 @@ from .curvature import mean_curvature as mean_curvature
 from .curvature import mean_curvature_vector as mean_curvature_vector
 from .curvature import principal_curvatures as principal_curvatures
 from .curvature import shape_tensor as shape_tensor
+from .discretization import Discretization as Discretization
+from .discretization import discretize as discretize
 from .frames import estimate_normals as estimate_normals
 from .frames import from_points as from_points
 from .frames import refit_normals as refit_normals

@@ -49,11 +49,12 @@ def shape_tensor(
         True
     """
     gradient = surface_gradient(cloud, neighbors, method=method)
-    return _symmetric(gradient(cloud.normals), cloud.normals)
+    return tensor_of(gradient(cloud.normals), cloud.normals)
 
 
 @jax.jit
-def _symmetric(tensor, n):
+def tensor_of(tensor, n):
+    """The shape tensor from the gradient of the normals."""
     project = jnp.eye(n.shape[1], dtype=n.dtype) - n[:, :, None] * n[:, None]
     tensor = jnp.einsum("nab,nbc,ncd->nad", project, tensor, project)
     return (tensor + tensor.mT) / 2
@@ -87,11 +88,12 @@ def mean_curvature(
         True
     """
     tensor = shape_tensor(cloud, neighbors, method=method)
-    return _mean(tensor)
+    return mean_of(tensor)
 
 
 @jax.jit
-def _mean(tensor):
+def mean_of(tensor):
+    """Mean curvature from the shape tensor."""
     return jnp.trace(tensor, axis1=1, axis2=2) / (tensor.shape[1] - 1)
 
 
@@ -121,11 +123,12 @@ def gauss_curvature(
         True
     """
     a = _in_tangent_plane(cloud, neighbors, method)[0]
-    return _determinant(a)
+    return gauss_of(a)
 
 
 @jax.jit
-def _determinant(a):
+def gauss_of(a):
+    """Gauss curvature from the shape tensor along two tangents."""
     return a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] ** 2
 
 
@@ -158,11 +161,12 @@ def principal_curvatures(
         >>> bool(jnp.abs(values - 0.5).max() < 0.02), directions.shape
         (True, (300, 2, 3))
     """
-    return _principal(*_in_tangent_plane(cloud, neighbors, method))
+    return principal_of(*_in_tangent_plane(cloud, neighbors, method))
 
 
 @jax.jit
-def _principal(a, tangents):
+def principal_of(a, tangents):
+    """Principal curvatures and directions from the shape tensor along two tangents."""
     mean, half = (a[:, 0, 0] + a[:, 1, 1]) / 2, (a[:, 0, 0] - a[:, 1, 1]) / 2
     square = half**2 + a[:, 0, 1] ** 2
     umbilic = square == 0
@@ -211,14 +215,19 @@ def _centred(points):
 
 
 def _in_tangent_plane(cloud, neighbors, method):
-    """The shape tensor as a symmetric 2 x 2 matrix, and the tangents that it refers to."""
     instance(cloud, PointCloud, "cloud")
+    check_surface(cloud)
+    return along_tangents(shape_tensor(cloud, neighbors, method=method), cloud.normals)
+
+
+def check_surface(cloud: PointCloud) -> None:
+    """Refuse plane curves."""
     if cloud.dim != 3:
         raise ValueError(f"a surface in 3 dimensions is needed, the cloud has {cloud.dim}")
-    return _along_tangents(shape_tensor(cloud, neighbors, method=method), cloud.normals)
 
 
 @jax.jit
-def _along_tangents(tensor, normals):
+def along_tangents(tensor, normals):
+    """The shape tensor as a symmetric 2 x 2 matrix, and the tangents that it refers to."""
     tangents = frames_of(normals)[:, :2]
     return jnp.einsum("nap,npq,nbq->nab", tangents, tensor, tangents), tangents

@@ -166,9 +166,15 @@ def directional_derivative(
         True
     """
     instance(cloud, PointCloud, "cloud")
-    direction = finite(_field(direction, (cloud.n, cloud.dim), "direction"), "direction")
-    gradient = build(cloud, neighbors, method, Gradient(), throw)
-    weights = _along(direction.astype(gradient.weights.dtype), gradient.weights)
+    _field(direction, (cloud.n, cloud.dim), "direction")
+    return along(build(cloud, neighbors, method, Gradient(), throw), direction)
+
+
+def along(gradient: Stencil, direction: Float[Array, "*n d"]) -> Stencil:
+    """The derivative along a vector field, from the gradient."""
+    direction = _field(direction, (gradient.n, *gradient.out_shape), "direction")
+    direction = finite(direction, "direction").astype(gradient.weights.dtype)
+    weights = _along(direction, gradient.weights)
     return Stencil(gradient.indices, weights, (), (), gradient.diagnostics, gradient.border)
 
 

@@ -72,6 +72,10 @@ class DCPSE(AbstractMethod):
     def batch_size(self):
         return 64 if self.order < 3 else 32
 
+    @property
+    def polynomial_degree(self):
+        return max(self.order, 2)
+
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
         k, dim = neighborhood.offsets.shape[:2]
         radius = neighborhood.support(dim - 1, self.support)

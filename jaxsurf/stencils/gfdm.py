@@ -67,12 +67,20 @@ class GFDM(AbstractMethod):
     def batch_size(self):
         return 256
 
+    @property
+    def polynomial_degree(self):
+        return max(self.degree, 2)
+
+    @property
+    def shares_moments(self):
+        return True
+
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
         plane = TangentPlane.of(neighborhood, self.degree, width=self.width, support=self.support)
         b = jnp.asarray(target.moments(len(plane.points), 1, self.degree), plane.points.dtype)
         found = moment_solve(plane.points, plane.weights, b, 1, self.degree)
         eta, condition, residual = found
-        eta = with_center(eta / plane.width**target.order)
+        eta = with_center(target.in_units(eta, plane.width, len(plane.points)))
         diagnostics = Diagnostics.of(neighborhood, condition, residual, plane.radius, 0)
         return target.assemble(eta, plane.tangents), diagnostics
 

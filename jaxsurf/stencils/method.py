@@ -106,6 +106,16 @@ class AbstractMethod(eqx.Module):
         """Weights of stencils, `(*components, k, *p)`, in units of length to the minus order."""
 
     @property
+    def polynomial_degree(self) -> int:
+        """Degree of the local polynomials that fields are integrated and interpolated by."""
+        return 2
+
+    @property
+    def shares_moments(self) -> bool:
+        """Whether derivatives of different order come from the same moments (see `Joint`)."""
+        return False
+
+    @property
     @abc.abstractmethod
     def batch_size(self) -> int:
         """How many stencils are computed at once: enough to be fast, few enough for the cache."""

@@ -27,6 +27,11 @@ def multi_indices(dim: int, low: int, high: int) -> np.ndarray:
     return np.array(graded, int).reshape(-1, dim)
 
 
+def polynomial_count(dim: int, high: int) -> int:
+    """Number of monomials of degree 0 to `high`."""
+    return math.comb(dim + high, high)
+
+
 @functools.cache
 def position(dim: int, high: int) -> dict[tuple[int, ...], int]:
     """Where each multi-index stands in `multi_indices(dim, 0, high)`."""

@@ -29,6 +29,10 @@ class AbstractTarget(eqx.Module):
     def columns(self, dim: int, high: int) -> list[np.ndarray]:
         """Values of each derivative at 0 on all monomials of degree 0 to `high`."""
 
+    def in_units(self, weights: Float[Array, "c k *p"], length: Float[Array, "*p"], dim: int):
+        """Weights on d coordinates, from those on coordinates divided by a length."""
+        return weights / length**self.order
+
     def assemble(
         self, weights: Float[Array, "c k *p"], axes: Float[Array, "t d *p"]
     ) -> Float[Array, "... k *p"]:
@@ -89,6 +93,37 @@ class Hessian(AbstractTarget):
         rows, cols = np.triu_indices(dim)
         matrix = jnp.zeros((dim, dim, *weights.shape[1:]), weights.dtype)
         return matrix.at[rows, cols].set(weights).at[cols, rows].set(weights)
+
+
+class Joint(AbstractTarget):
+    """Several operators at once, their components one after another, in the tangent plane.
+
+    For methods whose moments are the same for all orders of derivatives.
+    """
+
+    targets: tuple[AbstractTarget, ...]
+
+    @property
+    def order(self):
+        return max(target.order for target in self.targets)
+
+    def columns(self, dim, high):
+        return [column for target in self.targets for column in target.columns(dim, high)]
+
+    def _parts(self, weights, dim: int):
+        start = 0
+        for target in self.targets:
+            count = len(target.columns(dim, target.order))
+            yield target, weights[start : start + count]
+            start += count
+
+    def in_units(self, weights, length, dim):
+        parts = self._parts(weights, dim)
+        return jnp.concatenate([target.in_units(part, length, dim) for target, part in parts])
+
+    def assemble(self, weights, axes):
+        found = [target.assemble(part, axes) for target, part in self._parts(weights, len(axes))]
+        return jnp.concatenate([part.reshape(-1, *weights.shape[1:]) for part in found])
 
 
 class Partial(AbstractTarget):

@@ -223,4 +223,27 @@ TESTED = {
         "float32": _FORMS + "test_diagnostics_in_other_forms",
         "bad input": "(made by operators)",
     },
+    "discretize": {
+        "value": "test_discretization.py::test_operators_are_made_once, "
+        "test_discretization.py::test_integrals_over_the_torus, "
+        "test_discretization.py::test_interpolation, "
+        "test_discretization.py::test_moved_surfaces_are_new_ones",
+        "gradient": {
+            "points": "test_discretization.py::test_derivatives_of_integrals",
+            "normals": "test_discretization.py::test_derivatives_of_integrals",
+            "field": "test_discretization.py::test_derivatives_of_interpolation",
+        },
+        "jit": "test_discretization.py::test_moves_in_compiled_code",
+        "vmap": "test_discretization.py::test_moves_in_compiled_code",
+        "float32": "test_discretization.py::test_single_precision",
+        "bad input": "malformed",
+    },
+    "Discretization": {
+        "value": "test_discretization.py::test_moved_surfaces_are_new_ones",
+        "gradient": {"points": "test_discretization.py::test_moves_in_compiled_code"},
+        "jit": "test_discretization.py::test_moves_in_compiled_code",
+        "vmap": "test_discretization.py::test_moves_in_compiled_code",
+        "float32": "test_discretization.py::test_single_precision",
+        "bad input": "malformed",
+    },
 }

@@ -1,0 +1,489 @@
+r"""A surface and all that is computed from its points: operators, curvatures, integrals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from . import curvature, operators
+from .arguments import as_float, finite, instance, is_concrete, raise_at
+from .borders import Border, find_border
+from .build import build, choose_neighbors, residual_tolerance
+from .cloud import PointCloud
+from .frames import frames_of
+from .interpolation import interpolation_weights, nearest_points
+from .neighbors import Neighbors
+from .quadrature import cell_weights
+from .stencils.dcpse import DCPSE
+from .stencils.method import AbstractMethod
+from .stencils.monomials import polynomial_count
+from .stencils.stencil import Composition, Stencil
+from .stencils.targets import Gradient, Joint, Laplacian
+
+# So many neighbours may bound a cell; where points are very uneven, all are tried.
+_CELLS = 24
+
+# What `Discretization.code` says of a point.
+_CODES = {
+    1: "its position or normal is not finite",
+    2: "the normal of a neighbour next to it points to the other side",
+    3: "its stencil is degenerate",
+}
+
+
+class _Kept:
+    """A property that is computed once; anew where anything is traced."""
+
+    def __init__(self, make: Callable):
+        self.make = make
+        self.__doc__ = make.__doc__
+
+    def __set_name__(self, owner, name):
+        self.name = name
+
+    def __get__(self, surface, owner=None):
+        if surface is None:
+            return self
+        kept = surface.__dict__.get("_kept")
+        if kept is None:
+            kept = {}
+            object.__setattr__(surface, "_kept", kept)
+        if self.name in kept:
+            return kept[self.name]
+        value = self.make(surface)
+        if is_concrete(*jax.tree.leaves((surface, value))):
+            kept[self.name] = value
+        return value
+
+
+class Discretization(eqx.Module):
+    r"""A cloud with neighbours and a method: the surface, as far as it can be calculated with.
+
+    Made by `discretize`. Operators, curvatures and areas are computed when they are first asked
+    for, and kept; under `jit`, `vmap` and `grad` every time.
+
+    Args:
+        cloud: n points in d dimensions with unit normals.
+        neighbors: of every point.
+        method: how weights are computed.
+        border: the marked border of the cloud; None if it is closed.
+
+    Example:
+        >>> surface = js.discretize(js.torus(1_000, 1.0, 0.4), method=js.GFDM(degree=4))
+        >>> isinstance(surface, js.Discretization), surface.n
+        (True, 1000)
+    """
+
+    cloud: PointCloud
+    neighbors: Neighbors
+    method: AbstractMethod
+    border: Border | None = None
+
+    def __check_init__(self):
+        if not isinstance(self.cloud, PointCloud):
+            return  # a pytree of something else, as transformations make them
+        if self.neighbors.n != self.cloud.n:
+            raise ValueError(
+                f"neighbors of {self.neighbors.n} points, the cloud has {self.cloud.n}"
+            )
+
+    def __repr__(self):
+        return f"Discretization({self.cloud!r}, {self.neighbors!r}, {self.method!r})"
+
+    @property
+    def n(self) -> int:
+        """Number of points, switched-off ones included."""
+        return self.cloud.n
+
+    # --- operators -------------------------------------------------------------------------
+
+    @property
+    def laplacian(self) -> Stencil:
+        """Laplace–Beltrami operator, see `laplace_beltrami`."""
+        return self._joint[0] if self.method.shares_moments else self._laplacian
+
+    @property
+    def gradient(self) -> Stencil:
+        """Gradient along the surface, see `surface_gradient`."""
+        return self._joint[1] if self.method.shares_moments else self._gradient
+
+    @property
+    def divergence(self) -> Stencil:
+        """Divergence along the surface, see `surface_divergence`."""
+        gradient = self.gradient
+        known = (gradient.diagnostics, gradient.border)
+        return Stencil(gradient.indices, gradient.weights, (), (self.cloud.dim,), *known)
+
+    @property
+    def biharmonic(self) -> Composition:
+        """The Laplacian applied twice, see `biharmonic`."""
+        return self.laplacian @ self.laplacian
+
+    def directional_derivative(self, direction: Float[Array, "*n d"]) -> Stencil:
+        """Derivative along a vector field, see `js.directional_derivative`."""
+        return operators.along(self.gradient, direction)
+
+    def diffusion(self, diffusivity: Float[Array, "*n"]) -> Stencil:
+        """Diffusion in an inhomogeneous or anisotropic medium, see `js.diffusion`."""
+        return operators.diffusion(
+            self.cloud, diffusivity, neighbors=self.neighbors, method=self.method
+        )
+
+    @_Kept
+    def _joint(self) -> tuple[Stencil, Stencil]:
+        """Laplacian and gradient from one factorisation of the moment matrices."""
+        both = self._build(Joint((Laplacian(), Gradient())))
+        known = (both.diagnostics, both.border)
+        first = Stencil(both.indices, both.weights[:, 0], (), (), *known)
+        return first, Stencil(both.indices, both.weights[:, 1:], (self.cloud.dim,), (), *known)
+
+    @_Kept
+    def _laplacian(self) -> Stencil:
+        return self._build(Laplacian())
+
+    @_Kept
+    def _gradient(self) -> Stencil:
+        return self._build(Gradient())
+
+    def _build(self, target) -> Stencil:
+        return build(self.cloud, self.neighbors, self.method, target, True)
+
+    # --- curvatures ------------------------------------------------------------------------
+
+    @property
+    def shape_tensor(self) -> Float[Array, "n d d"]:
+        """See `shape_tensor`."""
+        return curvature.tensor_of(self.gradient(self.cloud.normals), self.cloud.normals)
+
+    @property
+    def mean_curvature(self) -> Float[Array, " n"]:
+        """See `mean_curvature`."""
+        return curvature.mean_of(self.shape_tensor)
+
+    @property
+    def gauss_curvature(self) -> Float[Array, " n"]:
+        """See `gauss_curvature`."""
+        curvature.check_surface(self.cloud)
+        return curvature.gauss_of(
+            curvature.along_tangents(self.shape_tensor, self.cloud.normals)[0]
+        )
+
+    @property
+    def principal_curvatures(self) -> tuple[Float[Array, "n 2"], Float[Array, "n 2 3"]]:
+        """See `principal_curvatures`."""
+        curvature.check_surface(self.cloud)
+        return curvature.principal_of(
+            *curvature.along_tangents(self.shape_tensor, self.cloud.normals)
+        )
+
+    # --- integrals -------------------------------------------------------------------------
+
+    @property
+    def areas(self) -> Float[Array, " n"]:
+        r"""Weights $a_i$ with $\sum_i a_i u(x_i) \approx \int_S u\,dS$, `(n,)`, in length^(d-1).
+
+        The cells $\{x : |x - x_i| \le |x - x_j|\}$ cut the surface into parts; over each the
+        local polynomial of a field, of degree p, is integrated. Zero at switched-off points.
+
+        Accuracy: error $O(h^{p+1})$ with p the degree of the method (the order, for DC-PSE), one
+        order more for even p on even points; $O(h^2)$ where the surface has a border
+        (`tests/test_discretization.py`).
+        Differentiable: forward and reverse, in points and normals.
+        Raises:
+            ValueError: the cell of a point is not closed by its neighbours (named by index), as
+                on a border that is not marked.
+        """
+        return self._areas[0]
+
+    @_Kept
+    def _areas(self) -> tuple[Float[Array, " n"], Array]:
+        degree = self.method.polynomial_degree
+        need = polynomial_count(self.cloud.dim - 1, degree)
+        if self.neighbors.k < need:
+            raise ValueError(
+                f"k = {self.neighbors.k} neighbours, polynomials of degree {degree} need at least "
+                f"{need}"
+            )
+        outward = None
+        if self.border is not None:
+            conormals = self.border.conormals(self.cloud)
+            outward = jnp.zeros_like(self.cloud.points).at[self.border.points].set(conormals)
+        for cells in (_CELLS, self.neighbors.k):
+            weights, _, closed = cell_weights(self.cloud, self.neighbors, degree, cells, outward)
+            if not is_concrete(closed) or bool(closed.all()):
+                break
+        if is_concrete(closed):
+            bad = ~np.asarray(closed)
+            text = (
+                "the neighbours of point {i} do not close its cell, out of {v} of them: mark the "
+                "border of the surface (`boundary`), or choose more neighbours"
+            )
+            raise_at(bad, text, np.asarray(self.neighbors.mask).sum(axis=1))
+        return _summed(weights, self.neighbors.indices.T), closed
+
+    def integrate(self, u: Float[Array, "n *c"]) -> Float[Array, "*c"]:
+        r"""$\int_S u\,dS$ of a field or of each of its components."""
+        return _integral(self.areas, self._field(u))
+
+    def mean(self, u: Float[Array, "n *c"]) -> Float[Array, "*c"]:
+        """Integral over area."""
+        areas = self.areas
+        return _integral(areas, self._field(u)) / jnp.sum(areas)
+
+    def inner(self, u: Float[Array, "n *c"], v: Float[Array, "n *c"]) -> Float[Array, ""]:
+        r"""$\int_S u \cdot v\,dS$; of fields with components, the sum over them."""
+        u, v = self._field(u), self._field(v)
+        if u.shape != v.shape:
+            raise ValueError(f"fields have shapes {u.shape} and {v.shape}, expected the same")
+        return jnp.sum(_integral(self.areas, u * v))
+
+    def interpolate(
+        self, u: Float[Array, "n *c"], points: Float[Array, "m d"]
+    ) -> Float[Array, "m *c"]:
+        """Values of a field at other points of the surface, or near it.
+
+        Args:
+            u: field on the cloud, `(n, *c)`.
+            points: where its values are wanted, `(m, d)`.
+
+        Returns:
+            Values `(m, *c)`, of the local polynomial of the cloud's point next to each.
+
+        Accuracy: error $O(h^{p+1})$ with p as for `areas`.
+        Differentiable: forward and reverse, in the field, the points wanted, and the cloud's points
+        and normals; for fixed nearest points.
+        Raises:
+            ValueError: wrong shapes, points that are not finite; points farther from the surface
+                than the neighbours reach (named by index).
+        """
+        u = self._field(u)
+        points = as_float(points, "points")
+        if points.ndim != 2 or points.shape[1] != self.cloud.dim:
+            raise ValueError(f"points have shape {points.shape}, expected (m, {self.cloud.dim})")
+        finite(points, "points")
+        centers = nearest_points(self.cloud, points)
+        if is_concrete(points, *jax.tree.leaves(self)):
+            self._check_reach(points, centers)
+        degree = self.method.polynomial_degree
+        slots, weights, _ = interpolation_weights(
+            self.cloud, self.neighbors, degree, points, centers
+        )
+        return _interpolated(weights, slots, u)
+
+    def _check_reach(self, points, centers) -> None:
+        x, centers = np.asarray(self.cloud.points), np.asarray(centers)
+        distance = np.linalg.norm(np.asarray(points) - x[centers], axis=1)
+        lists, used = (
+            np.asarray(a)[centers] for a in (self.neighbors.indices, self.neighbors.mask)
+        )
+        reach = np.linalg.norm(np.where(used[:, :, None], x[lists], x[centers][:, None])
+                               - x[centers][:, None], axis=2).max(axis=1)  # fmt: skip
+        raise_at(
+            distance > reach,
+            "points: {i} is {v:.3g} away from the nearest point of the cloud, farther than the "
+            "neighbours of that reach",
+            distance,
+        )
+
+    def _field(self, u) -> Float[Array, "n *c"]:
+        u = as_float(u, "field")
+        if u.ndim < 1 or u.shape[0] != self.n:
+            raise ValueError(f"field has shape {u.shape}, expected ({self.n}, ...)")
+        return u
+
+    # --- motion ----------------------------------------------------------------------------
+
+    def moved(
+        self, points: Float[Array, "n d"], normals: Float[Array, "n d"] | None = None
+    ) -> Discretization:
+        r"""The same surface with its points elsewhere: same neighbours, border, mask and method.
+
+        Args:
+            points: new positions, `(n, d)`.
+            normals: new unit normals; if None those of the tangents carried along by the motion,
+                $n \propto F t_1 \times F t_2$ with F the gradient of the new positions on the
+                surface as it was.
+
+        Returns:
+            The moved surface. Its spacing, if it has one, is stretched with its area.
+
+        Accuracy: normals as `gradient`, $O(h^p)$; of rotations and changes of scale to round-off
+            (`tests/test_discretization.py::test_moved_surfaces_are_new_ones`).
+        Differentiable: forward and reverse, in the points and normals given and in those of the
+        surface as it was.
+        Raises:
+            ValueError: wrong shapes; on concrete arrays points that are not finite or coincide,
+                or that fold the surface. Under `jit`, `vmap` and `grad` see `code`.
+        """
+        points = as_float(points, "points")
+        if points.shape != self.cloud.points.shape:
+            raise ValueError(
+                f"points have shape {points.shape}, expected {self.cloud.points.shape}"
+            )
+        finite(points, "points")
+        found, stretch = _carried(self.gradient, self.cloud.normals, self.cloud.points, points)
+        if self.cloud.active is not None:
+            found = jnp.where(self.cloud.active[:, None], found, self.cloud.normals)
+        if normals is None:
+            normals = found
+        spacing = self.cloud.spacing
+        if spacing is not None:
+            spacing = spacing * stretch ** (1 / (self.cloud.dim - 1))
+        cloud = PointCloud(
+            points,
+            normals,
+            boundary=self.cloud.boundary,
+            active=self.cloud.active,
+            spacing=spacing,
+        )
+        surface = Discretization(cloud, self.neighbors, self.method, self.border)
+        if is_concrete(*jax.tree.leaves(surface)):
+            surface.check()
+        return surface
+
+    @property
+    def code(self) -> Int[Array, " n"]:
+        """What is wrong with each point: what would be an error outside `jit`, as a number.
+
+        0: nothing. 1: its position or normal is not finite. 2: the normal of a neighbour next to it
+        points to the other side. 3: its stencil is degenerate.
+        """
+        return self._code
+
+    @_Kept
+    def _code(self) -> Int[Array, " n"]:
+        diagnostics = self.laplacian.diagnostics
+        assert diagnostics is not None
+        code = _judged(self.cloud, self.neighbors, diagnostics.residual)
+        return jax.lax.stop_gradient(code)
+
+    def check(self) -> None:
+        """Raise a ValueError that names the first point whose `code` is not 0; concrete only."""
+        code = np.asarray(self.code)
+        names = np.array([_CODES.get(int(c), "") for c in code])
+        raise_at(code != 0, "point {i}: {v}", names)
+
+
+def discretize(
+    cloud: PointCloud,
+    neighbors: Neighbors | None = None,
+    *,
+    method: AbstractMethod = DCPSE(order=2),
+) -> Discretization:
+    r"""A surface that can be calculated with: a cloud, its neighbours and a method.
+
+    Args:
+        cloud: n points in d dimensions with unit normals.
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        method: how weights are computed.
+
+    Returns:
+        The surface, with its operators, curvatures and integrals.
+
+    Accuracy: of each part as its own function has it; integrals see `Discretization.areas`.
+    Differentiable: forward and reverse, in points and normals, for fixed neighbours.
+    Raises:
+        TypeError: no cloud, neighbours or method.
+        ValueError: as `choose_neighbors` and `find_border`.
+
+    Example:
+        >>> surface = js.discretize(js.sphere(1_000), method=js.GFDM(degree=4))
+        >>> z = surface.cloud.points[:, 2]
+        >>> bool(jnp.abs(surface.laplacian(z) + 2 * z).max() < 1e-3)
+        True
+        >>> bool(abs(surface.integrate(z**2) - 4 * jnp.pi / 3) < 1e-5)
+        True
+    """
+    instance(cloud, PointCloud, "cloud")
+    instance(method, AbstractMethod, "method", "DCPSE(order=2) or GFDM(degree=4), say")
+    if neighbors is None:
+        neighbors = choose_neighbors(cloud, method=method)
+    instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
+    border = None
+    if cloud.boundary is not None and np.asarray(cloud.boundary).any():
+        border = find_border(cloud)
+    return Discretization(cloud, neighbors, method, border)
+
+
+@jax.jit
+def _summed(weights, indices):
+    return jnp.zeros(weights.shape[1], weights.dtype).at[indices].add(weights)
+
+
+@jax.jit
+def _integral(areas, u):
+    return jnp.tensordot(areas, u, 1)
+
+
+@jax.jit
+def _interpolated(weights, slots, u):
+    weights = weights.reshape(*weights.shape, *(1,) * (u.ndim - 1))
+    add = lambda total, slot: (total + slot[0] * u[slot[1]], None)
+    zero = jnp.zeros((slots.shape[1], *u.shape[1:]), jnp.result_type(weights, u))
+    return jax.lax.scan(add, zero, (weights, slots))[0]
+
+
+# Each brings normals closer to where a rigid motion takes them, by the error of the gradient.
+_TURNS = 4
+
+
+@jax.jit
+def _carried(gradient, normals, before, after):
+    """Normals carried along by a motion of the points, and the factor it stretches areas by.
+
+    The gradient of the positions takes a tangent to itself but for its error, $F_0 t = A t + s n$.
+    So does that of the new positions, with the images in place of t and n; which A and s then tell.
+    """
+    tangents = frames_of(normals)[:, :-1]
+    images = [
+        jnp.einsum("nxs,nts->ntx", gradient(x - jnp.mean(x, axis=0)), tangents)
+        for x in (before, after)
+    ]
+    a = jnp.einsum("ntx,nux->ntu", images[0], tangents)
+    s = jnp.einsum("ntx,nx->nt", images[0], normals)
+    ahead = jnp.zeros_like(normals)
+    for _ in range(_TURNS):
+        normal = _crossed(_solved(a, images[1] - s[:, :, None] * ahead[:, None]))
+        length = jnp.sqrt(jnp.sum(normal**2, axis=1))
+        normal = normal / jnp.where(length > 0, length, 1)[:, None]
+        ahead = normal * (length ** (1 / (normals.shape[1] - 1)))[:, None]
+    return normal, length
+
+
+def _solved(a, b):
+    """Solutions of the 1 x 1 or 2 x 2 systems of all points."""
+    if a.shape[1] == 1:
+        return b / a
+    (p, q), (r, s) = jnp.moveaxis(a, 0, -1)
+    inverse = jnp.stack([jnp.stack([s, -q]), jnp.stack([-r, p])]) / (p * s - q * r)
+    return jnp.einsum("tun,nux->ntx", inverse, b)
+
+
+def _crossed(tangents):
+    """The normal of a plane or line of tangents, as long as they are large."""
+    if tangents.shape[1] == 1:
+        return jnp.stack([-tangents[:, 0, 1], tangents[:, 0, 0]], axis=1)
+    return jnp.cross(tangents[:, 0], tangents[:, 1])
+
+
+@jax.jit
+def _judged(cloud, neighbors, residual):
+    points, normals = cloud.points, cloud.normals
+    ill = ~jnp.all(jnp.isfinite(points) & jnp.isfinite(normals), axis=1)
+
+    def turned(found, slot):
+        index, used = slot
+        return found | (used & (jnp.sum(normals[index] * normals, axis=1) < 0)), None
+
+    # Of those farther away, other lists would leave out what has turned.
+    ring = 2 * points.shape[1] + 1
+    lists = (neighbors.indices[:, 1:ring].T, neighbors.mask[:, 1:ring].T)
+    folded = jax.lax.scan(turned, jnp.zeros(len(points), bool), lists)[0]
+    poor = ~(residual < residual_tolerance(residual.dtype))
+    code = jnp.where(ill, 1, jnp.where(folded, 2, jnp.where(poor, 3, 0)))
+    return jnp.where(neighbors.mask[:, 0], code, 0)

@@ -1,0 +1,75 @@
+"""Values of fields at other points of a surface, by the polynomials that the stencils fit."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.spatial import cKDTree
+
+from .arguments import is_concrete
+from .build import blocks_of, neighborhood, rows_of
+from .cloud import PointCloud
+from .compiling import sized_jit
+from .neighbors import Neighbors, Rows
+from .stencils.method import with_center
+from .stencils.moments import blockwise, in_blocks, moment_solve
+from .stencils.monomials import monomials
+from .stencils.plane import TangentPlane
+
+_BATCH = 128
+
+
+def nearest_points(cloud: PointCloud, points: Float[Array, "m d"]) -> Int[Array, " m"]:
+    """The active point of the cloud next to each of these."""
+    if is_concrete(cloud.points, cloud.active, points):
+        rows = np.flatnonzero(cloud.host_active)
+        tree = cKDTree(np.asarray(cloud.points, float)[rows])
+        return jnp.asarray(rows[tree.query(np.asarray(points, float))[1]].astype(np.int32))
+    return _nearest(cloud.points, cloud.active, points)
+
+
+@jax.jit
+def _nearest(points, active, wanted):
+    def nearest(x):
+        squared = jnp.sum((points - x) ** 2, axis=1)
+        return jnp.argmin(squared if active is None else jnp.where(active, squared, jnp.inf))
+
+    return jax.lax.map(nearest, jax.lax.stop_gradient(wanted), batch_size=64).astype(jnp.int32)
+
+
+def interpolation_weights(
+    cloud: PointCloud,
+    neighbors: Neighbors,
+    degree: int,
+    points: Float[Array, "m d"],
+    centers: Int[Array, " m"],
+) -> tuple[Int[Array, "k m"], Float[Array, "k m"], Float[Array, " m"]]:
+    """Neighbours of the points next to these, their weights, and the residuals of the fits.
+
+    Over the tangent plane of its centre each field is the polynomial that fits the neighbours and
+    passes through the centre; it is read off where the point stands above that plane.
+    """
+    radius = neighbors.radius
+    lists = Rows(neighbors.indices[centers], neighbors.mask[centers], radius)
+    blocks = blocks_of(cloud, lists, centers, _BATCH)
+    at = in_blocks((points - cloud.points[centers]).T, _BATCH)
+    weights, residual = rows_of(_of_blocks(blocks, at, degree), len(points))
+    return lists.indices.T, weights, residual
+
+
+@sized_jit
+def _of_blocks(blocks, offsets, degree: int):
+    def weights(block):
+        around, offset = neighborhood(block[0]), block[1]
+        plane = TangentPlane.of(around, degree)
+        place = jnp.sum(plane.tangents * offset, axis=1) / plane.width
+        wanted = monomials(place, degree)[1:, None]
+        found = moment_solve(plane.points, plane.weights, wanted, 1, degree)
+        eta = with_center(found[0])[0].at[0].add(1)
+        # A place on the point itself asks for nothing: no residual to be measured by.
+        residual = jnp.where(jnp.any(wanted != 0, axis=(0, 1)), found[2], 0)
+        return jnp.where(around.mask, eta, 0), residual
+
+    return blockwise(weights, (blocks, offsets))

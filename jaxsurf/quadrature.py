@@ -1,0 +1,274 @@
+r"""Weights that integrate over a surface, of high order.
+
+The surface is cut into the cells of the points, $\{x : |x - x_i| \le |x - x_j|\}$. In the tangent
+plane of its point a cell is a polygon, whose sides are slightly curved; with the surface as a graph
+over that plane, fitted to the neighbours, the moments of the cell are found by Gauss's rule.
+A function is integrated over a cell as its local polynomial is: from these moments come weights of
+all neighbours, exactly as those of a derivative come from its values on monomials
+(`stencils/moments.py`). Their sums over all cells integrate over the surface.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+from jaxtyping import Array, Bool, Float
+
+from .build import blocks_of, neighborhood, rows_of
+from .cloud import PointCloud
+from .compiling import sized_jit
+from .neighbors import Neighbors
+from .stencils.method import Neighborhood, with_center
+from .stencils.moments import blockwise, in_blocks, moment_solve
+from .stencils.monomials import differentiation, monomial_rows, multi_indices
+from .stencils.plane import TangentPlane
+
+_BATCH = 128
+# Newton steps from cells with straight sides to those on the surface: each squares what is left of
+# an error of the size (spacing x curvature)^2.
+_STEPS = 2
+
+
+def cell_weights(
+    cloud: PointCloud,
+    neighbors: Neighbors,
+    degree: int,
+    cells: int,
+    outward: Float[Array, "n d"] | None,
+) -> tuple[Float[Array, "k n"], Float[Array, " n"], Bool[Array, " n"]]:
+    """Weights of the neighbours in the integral over each cell, its area, and whether it is closed.
+
+    Args:
+        degree: of the polynomials.
+        cells: the first so many neighbours may bound a cell, the point itself included.
+        outward: conormals where the surface ends, zero elsewhere.
+
+    Returns:
+        Weights `(k, n)`; areas; whether each cell is bounded by neighbours so near that no other
+        point can have a part of it.
+    """
+    blocks = blocks_of(cloud, neighbors, jnp.arange(cloud.n), _BATCH)
+    lines = None if outward is None else in_blocks(outward.T, _BATCH)
+    weights, (areas, closed) = rows_of(
+        _of_blocks(blocks, lines, degree, min(cells, neighbors.k)), cloud.n
+    )
+    return weights, areas, closed
+
+
+@sized_jit
+def _of_blocks(blocks, lines, degree: int, cells: int):
+    def rule(block):
+        return _rule(neighborhood(block[0]), block[1], degree, cells)
+
+    return blockwise(rule, (blocks, lines))
+
+
+def _rule(around: Neighborhood, outward, degree: int, cells: int):
+    plane = TangentPlane.of(around, degree)
+    graph = Graph(plane.surface(degree), degree, len(plane.points))
+    moments, closed = _moments(plane, around.mask, graph, cells, outward)
+    on, unit = around.mask[0], plane.width**graph.dim
+    # The fit knows differences from the point itself: the constant is the area times its value.
+    eta = moment_solve(plane.points, plane.weights, moments[1:, None], 1, degree)[0]
+    area = jnp.where(on, unit * moments[0], 0)
+    eta = with_center(unit * eta)[0].at[0].add(area)
+    return jnp.where(around.mask, eta, 0), (area, closed | ~on)
+
+
+class Graph(eqx.Module):
+    """The surface as a polynomial over the tangent plane.
+
+    Args:
+        coefficients: of degree 1 to `degree`.
+    """
+
+    coefficients: Float[Array, "m *p"]
+    degree: int = eqx.field(static=True)
+    dim: int = eqx.field(static=True)
+
+    @property
+    def slopes(self) -> list[list[Array]]:
+        """Coefficients of the derivatives along the axes, of degree 0 to `degree` - 1."""
+        count = len(multi_indices(self.dim, 0, self.degree - 1))
+        return [
+            [_total(f * c for f, c in zip(row[1:], self.coefficients) if f) for row in rows[:count]]
+            for rows in differentiation(self.dim, self.degree).tolist()
+        ]
+
+    def at(self, q):
+        """Heights and slopes."""
+        rows = monomial_rows(q, self.degree)
+        z = _total(c * row for c, row in zip(self.coefficients, rows[1:]))
+        return z, jnp.stack([_total(c * row for c, row in zip(s, rows)) for s in self.slopes])
+
+
+class Sides(eqx.Module):
+    r"""What bounds a cell: the planes $x\cdot d = b$ half way to its neighbours.
+
+    Args:
+        flat: d along the tangents.
+        high: d along the normal.
+        offset: b.
+        on: which of them count.
+    """
+
+    flat: Float[Array, "t r *p"]
+    high: Float[Array, "r *p"]
+    offset: Float[Array, "r *p"]
+    on: Bool[Array, "r *p"]
+
+    @classmethod
+    def of(cls, plane: TangentPlane, mask, cells: int, outward) -> Sides:
+        """Those of the first neighbours, and at the end of a surface the line of its border."""
+        flat, high, on = plane.points[:, 1:cells], plane.heights[1:cells], mask[1:cells]
+        offset = (jnp.sum(flat**2, axis=0) + high**2) / 2
+        if outward is not None:
+            line = jnp.sum(plane.tangents * outward, axis=1)[:, None]
+            flat = jnp.concatenate([flat, line], axis=1)
+            high, offset = (jnp.pad(a, [(0, 1)] + [(0, 0)] * (a.ndim - 1)) for a in (high, offset))
+            on = jnp.concatenate([on, jnp.any(line != 0, axis=0)])
+        return cls(flat, high, jnp.where(on, offset, 0), on)
+
+    def chosen(self, which) -> Sides:
+        """One of them at every place, by number."""
+        number = np.arange(len(self.on)).reshape(-1, *(1,) * (which.ndim - 1))
+        pick = lambda a: jnp.sum(jnp.where(number == which[:, None], a, 0), axis=1)
+        flat = jnp.stack([pick(a) for a in self.flat])
+        return Sides(flat, pick(self.high), pick(self.offset), jnp.ones_like(which, bool))
+
+    def miss(self, graph: Graph, q):
+        """How far the points of the surface over q are beyond them, and the slope of that."""
+        z, slope = graph.at(q)
+        beyond = jnp.sum(q * self.flat, axis=0) + z * self.high - self.offset
+        return beyond, self.flat + slope * self.high
+
+
+def _moments(plane: TangentPlane, mask, graph: Graph, cells: int, outward):
+    r"""$\int q^\gamma\,dA$ over each cell for all monomials up to the degree; is it closed?"""
+    sides = Sides.of(plane, mask, cells, outward)
+    degree = graph.degree
+    nodes = degree // 2 + 1
+    find = _ways_of_curve if graph.dim == 1 else functools.partial(_ways, nodes=nodes)
+    ends, measure, closed, of_ways = find(sides, graph)
+
+    def newton(length, sides, graph, ends):
+        beyond, slope = sides.miss(graph, length * ends)
+        rate = jax.lax.stop_gradient(jnp.sum(slope * ends, axis=0))
+        return length - beyond / jnp.where(rate > 0, rate, 1)
+
+    length = _root(newton, jnp.ones_like(measure), of_ways(sides), graph, ends)
+    ends = length * ends
+    measure = measure * length**graph.dim
+
+    # Along a way each monomial is a power.
+    rows = monomial_rows(ends, degree)
+    order = multi_indices(graph.dim, 0, degree).sum(axis=1)
+    slopes = [
+        [_total(c * row for c, row, g in zip(axis, rows, order) if g == power)
+         for power in range(degree)]
+        for axis in graph.slopes
+    ]  # fmt: skip
+    sums = [jnp.zeros_like(length)] * (degree + 1)
+    for s, weight in zip(*_gauss(nodes, graph.dim - 1)):
+        gradient = [_total(a * s**power for power, a in enumerate(axis)) for axis in slopes]
+        stretch = weight * jnp.sqrt(1 + _total(g * g for g in gradient))
+        sums = [a + s**power * stretch for power, a in enumerate(sums)]
+    sums = [measure * a for a in sums]
+    return jnp.stack([jnp.sum(sums[g] * row, axis=0) for g, row in zip(order, rows)]), closed
+
+
+def _ways(sides: Sides, graph: Graph, nodes: int):
+    """Ways from the point to the sides of its cell, `nodes` to each.
+
+    Returns:
+        Their ends if the sides were straight; what each stands for; whether the cell is closed;
+        and what gives each way its side.
+    """
+    flat, offset, on = jax.lax.stop_gradient((sides.flat, sides.offset, sides.on))
+    # Side j is a_j + t c_j with c_j perpendicular to d_j, of which all others cut off a part.
+    squared = jnp.sum(flat**2, axis=0)
+    foot = offset / jnp.where(squared > 0, squared, 1)
+    dot = flat[0][:, None] * flat[0] + flat[1][:, None] * flat[1]
+    cross = flat[0][:, None] * flat[1] - flat[1][:, None] * flat[0]
+    room = offset - foot[:, None] * dot
+    other = ~np.eye(len(on), dtype=bool).reshape(len(on), len(on), *(1,) * (on.ndim - 1)) & on
+    at = room / jnp.where(cross == 0, 1, cross)
+    before = jnp.where(other & (cross < 0), at, -jnp.inf)
+    after = jnp.where(other & (cross > 0), at, jnp.inf)
+    none = jnp.any(other & (cross == 0) & (room < 0), axis=1)
+    low, high = jnp.max(before, axis=1), jnp.min(after, axis=1)
+    used = on & (squared > 0) & (low < high) & ~none
+    bounded = jnp.isfinite(low) & jnp.isfinite(high)
+
+    def corner(t, cutter):
+        t = jnp.where(used & bounded, t, 0)
+        q = jnp.stack([foot * flat[0] - t * flat[1], foot * flat[1] + t * flat[0]])
+
+        def newton(q, sides, its, graph):
+            (u, a), (v, b) = sides.miss(graph, q), its.miss(graph, q)
+            a, b = jax.lax.stop_gradient((a, b))
+            size = a[0] * b[1] - a[1] * b[0]
+            size = jnp.where(size == 0, 1, size)
+            return q - jnp.stack([b[1] * u - a[1] * v, a[0] * v - b[0] * u]) / size
+
+        return jnp.where(used & bounded, _root(newton, q, sides, sides.chosen(cutter), graph), 0)
+
+    first = corner(low, jnp.argmax(before, axis=1))
+    last = corner(high, jnp.argmin(after, axis=1))
+    turn = first[0] * last[1] - first[1] * last[0]
+    # No point beyond the neighbours looked at can have a part of what is nearer to this one.
+    reach = jnp.max(jnp.where(used, jnp.sum(last**2, axis=0), 0), axis=0)
+    farthest = jnp.max(jnp.where(on & (offset > 0), squared, 0), axis=0)
+    closed = jnp.all(~used | bounded, axis=0) & jnp.any(used, axis=0)
+    closed = closed & (4 * reach <= farthest)
+    share, weights = _gauss(nodes, 0)
+    ends = jnp.concatenate([first + x * (last - first) for x in share], axis=1)
+    measure = jnp.concatenate([w * turn for w in weights])
+
+    def of_ways(sides):
+        flat = jnp.concatenate([sides.flat] * nodes, axis=1)
+        high, offset, on = (
+            jnp.concatenate([a] * nodes) for a in (sides.high, sides.offset, sides.on)
+        )
+        return Sides(flat, high, offset, on)
+
+    return ends, measure, closed, of_ways
+
+
+def _ways_of_curve(sides: Sides, graph: Graph):
+    """The same for a curve, with one way to either side."""
+    # The product of an end and the way to it does not depend on the end.
+    flat, offset, on = jax.lax.stop_gradient((sides.flat[0], sides.offset, sides.on))
+    at = offset / jnp.where(flat == 0, 1, flat)
+    after = jnp.where(on & (flat > 0), at, jnp.inf)
+    before = jnp.where(on & (flat < 0), at, -jnp.inf)
+    ends = jnp.stack([jnp.max(before, axis=0), jnp.min(after, axis=0)])
+    which = jnp.stack([jnp.argmax(before, axis=0), jnp.argmin(after, axis=0)])
+    closed = jnp.all(jnp.isfinite(ends), axis=0)
+    ends = jnp.where(jnp.isfinite(ends), ends, 0)
+    return ends[None], jnp.abs(ends), closed, lambda sides: sides.chosen(which)
+
+
+def _root(newton: Callable, start, *known):
+    """The end of some Newton steps, of which the last has the derivative of the root."""
+    fixed = jax.lax.stop_gradient(known)
+    near = jax.lax.fori_loop(0, _STEPS, lambda _, x: newton(x, *fixed), start)
+    # Without the barrier the compiler finds the value again for every use of it.
+    return jax.lax.optimization_barrier(newton(jax.lax.stop_gradient(near), *known))
+
+
+@functools.cache
+def _gauss(nodes: int, power: int) -> tuple[list[float], list[float]]:
+    r"""Gauss's rule for $\int_0^1 s^p f(s)\,ds$."""
+    x, w = scipy.special.roots_jacobi(nodes, 0, power)
+    return ((1 + x) / 2).tolist(), (w / 2 ** (power + 1)).tolist()
+
+
+def _total(terms):
+    return functools.reduce(jnp.add, terms)

@@ -26,7 +26,7 @@ from .compiling import sized_jit
 from .neighbors import Neighbors
 from .stencils.method import Neighborhood, with_center
 from .stencils.moments import blockwise, in_blocks, moment_solve
-from .stencils.monomials import differentiation, monomial_rows, multi_indices
+from .stencils.monomials import differentiation, monomials_by_degree, polynomial_count
 from .stencils.plane import TangentPlane
 
 _BATCH = 128
@@ -94,18 +94,37 @@ class Graph(eqx.Module):
 
     @property
     def slopes(self) -> list[list[Array]]:
-        """Coefficients of the derivatives along the axes, of degree 0 to `degree` - 1."""
-        count = len(multi_indices(self.dim, 0, self.degree - 1))
+        """Coefficients of the derivatives along the axes, by degree from 0 to `degree` - 1."""
+        matrices = differentiation(self.dim, self.degree)[:, :, 1:]
         return [
-            [_total(f * c for f, c in zip(row[1:], self.coefficients) if f) for row in rows[:count]]
-            for rows in differentiation(self.dim, self.degree).tolist()
+            [_places(matrix[part], self.coefficients) for part in self.parts[:-1]]
+            for matrix in matrices
         ]
+
+    @property
+    def parts(self) -> list[slice]:
+        """Which of all monomials are of each degree."""
+        last = [polynomial_count(self.dim, g) for g in range(self.degree + 1)]
+        return [slice(start, stop) for start, stop in zip([0, *last], last)]
 
     def at(self, q):
         """Heights and slopes."""
-        rows = monomial_rows(q, self.degree)
-        z = _total(c * row for c, row in zip(self.coefficients, rows[1:]))
-        return z, jnp.stack([_total(c * row for c, row in zip(s, rows)) for s in self.slopes])
+        rows = monomials_by_degree(q, self.degree)
+        own = [self.coefficients[part.start - 1 : part.stop - 1] for part in self.parts[1:]]
+        slopes = jnp.stack([_polynomial(c, rows) for c in self.slopes])
+        return _polynomial(own, rows[1:]), slopes
+
+
+def _polynomial(coefficients: list[Array], rows: list[Array]):
+    """Sum over all degrees, kept apart: to put slices together again takes longer than all else."""
+    parts = [jnp.sum(c[:, None] * row, axis=0) for c, row in zip(coefficients, rows)]
+    return functools.reduce(jnp.add, parts)
+
+
+def _places(matrix: np.ndarray, a):
+    """A matrix with one entry in a row times a vector over the basis."""
+    power = matrix.max(axis=1).reshape(-1, *(1,) * (a.ndim - 1))
+    return a[matrix.argmax(axis=1)] * power
 
 
 class Sides(eqx.Module):
@@ -167,20 +186,16 @@ def _moments(plane: TangentPlane, mask, graph: Graph, cells: int, outward):
     measure = measure * length**graph.dim
 
     # Along a way each monomial is a power.
-    rows = monomial_rows(ends, degree)
-    order = multi_indices(graph.dim, 0, degree).sum(axis=1)
-    slopes = [
-        [_total(c * row for c, row, g in zip(axis, rows, order) if g == power)
-         for power in range(degree)]
-        for axis in graph.slopes
-    ]  # fmt: skip
-    sums = [jnp.zeros_like(length)] * (degree + 1)
-    for s, weight in zip(*_gauss(nodes, graph.dim - 1)):
-        gradient = [_total(a * s**power for power, a in enumerate(axis)) for axis in slopes]
-        stretch = weight * jnp.sqrt(1 + _total(g * g for g in gradient))
-        sums = [a + s**power * stretch for power, a in enumerate(sums)]
-    sums = [measure * a for a in sums]
-    return jnp.stack([jnp.sum(sums[g] * row, axis=0) for g, row in zip(order, rows)]), closed
+    rows = monomials_by_degree(ends, degree)
+    at, share = _gauss(nodes, graph.dim - 1)
+    powers = np.array(at) ** np.arange(degree + 1)[:, None]
+    square = jnp.ones((nodes, *length.shape), length.dtype)
+    for slope in graph.slopes:
+        along = jnp.stack([_polynomial([c], [row]) for c, row in zip(slope, rows)])
+        square = square + jnp.tensordot(powers[:-1].T, along, 1) ** 2
+    sums = jnp.tensordot(powers * np.array(share), jnp.sqrt(square), 1) * measure
+    found = [jnp.sum(row * total, axis=1) for row, total in zip(rows, sums)]
+    return jnp.concatenate(found), closed
 
 
 def _ways(sides: Sides, graph: Graph, nodes: int):
@@ -268,7 +283,3 @@ def _gauss(nodes: int, power: int) -> tuple[list[float], list[float]]:
     r"""Gauss's rule for $\int_0^1 s^p f(s)\,ds$."""
     x, w = scipy.special.roots_jacobi(nodes, 0, power)
     return ((1 + x) / 2).tolist(), (w / 2 ** (power + 1)).tolist()
-
-
-def _total(terms):
-    return functools.reduce(jnp.add, terms)

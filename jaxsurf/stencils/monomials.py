@@ -51,6 +51,11 @@ def _parents(dim: int, high: int) -> tuple[tuple[int, int], ...]:
 
 def monomials(x: Float[Array, "dim *q"], high: int) -> Float[Array, "m *q"]:
     """All monomials of degree 0 to `high`, one multiplication each, a degree at a time."""
+    return jnp.concatenate(monomials_by_degree(x, high))
+
+
+def monomials_by_degree(x: Float[Array, "dim *q"], high: int) -> list[Float[Array, "_ *q"]]:
+    """The same with each degree apart."""
     dim = len(x)
     degrees = [jnp.ones_like(x[:1])]
     for degree in range(1, high + 1):
@@ -59,7 +64,7 @@ def monomials(x: Float[Array, "dim *q"], high: int) -> Float[Array, "m *q"]:
         lower = degrees[-1]
         tails = [math.comb(degree - 1 + dim - 1 - a, dim - 1 - a) for a in range(dim)]
         degrees.append(jnp.concatenate([x[a] * lower[-t:] for a, t in enumerate(tails)]))
-    return jnp.concatenate(degrees)
+    return degrees
 
 
 def monomial_rows(

@@ -24,7 +24,7 @@ from .build import blocks_of, neighborhood, rows_of
 from .cloud import PointCloud
 from .compiling import sized_jit
 from .neighbors import Neighbors
-from .stencils.method import Neighborhood, with_center
+from .stencils.method import with_center
 from .stencils.moments import blockwise, in_blocks, moment_solve
 from .stencils.monomials import differentiation, monomials_by_degree, polynomial_count
 from .stencils.plane import TangentPlane
@@ -55,30 +55,59 @@ def cell_weights(
     """
     blocks = blocks_of(cloud, neighbors, jnp.arange(cloud.n), _BATCH)
     lines = None if outward is None else in_blocks(outward.T, _BATCH)
-    weights, (areas, closed) = rows_of(
-        _of_blocks(blocks, lines, degree, min(cells, neighbors.k)), cloud.n
-    )
-    return weights, areas, closed
+    mask, cells = blocks[2], min(cells, neighbors.k)
+    # Programs of their own: in one, the compiler finds much again for every use of it, and a
+    # derivative took fifteen times as long as the value.
+    planes, graphs = _surfaces(blocks, degree)
+    ways, closed = _ways_of_blocks(planes, graphs, mask, lines, cells)
+    moments = _moments_of_blocks(planes, graphs, mask, lines, ways, cells)
+    weights, areas = _weights_of_blocks(planes, mask, moments, degree)
+    weights, (areas, closed) = rows_of((weights, (areas, closed)), cloud.n)
+    return weights, areas, closed | ~neighbors.mask[:, 0]
 
 
 @sized_jit
-def _of_blocks(blocks, lines, degree: int, cells: int):
-    def rule(block):
-        return _rule(neighborhood(block[0]), block[1], degree, cells)
+def _surfaces(blocks, degree: int):
+    """The tangent planes, and the surface as a polynomial over each."""
 
-    return blockwise(rule, (blocks, lines))
+    def fit(block):
+        plane = TangentPlane.of(neighborhood(block), degree)
+        return plane, Graph(plane.surface(degree), degree, len(plane.points))
+
+    return blockwise(fit, blocks)
 
 
-def _rule(around: Neighborhood, outward, degree: int, cells: int):
-    plane = TangentPlane.of(around, degree)
-    graph = Graph(plane.surface(degree), degree, len(plane.points))
-    moments, closed = _moments(plane, around.mask, graph, cells, outward)
-    on, unit = around.mask[0], plane.width**graph.dim
-    # The fit knows differences from the point itself: the constant is the area times its value.
-    eta = moment_solve(plane.points, plane.weights, moments[1:, None], 1, degree)[0]
-    area = jnp.where(on, unit * moments[0], 0)
-    eta = with_center(unit * eta)[0].at[0].add(area)
-    return jnp.where(around.mask, eta, 0), (area, closed | ~on)
+@sized_jit
+def _ways_of_blocks(planes, graphs, mask, lines, cells: int):
+    def ways(block):
+        plane, graph, mask, line = block
+        sides = Sides.of(plane, mask, cells, line)
+        return _ways_of_curve(sides) if graph.dim == 1 else _ways(sides, graph)
+
+    return blockwise(ways, (planes, graphs, mask, lines))
+
+
+@sized_jit
+def _moments_of_blocks(planes, graphs, mask, lines, ways, cells: int):
+    def moments(block):
+        plane, graph, mask, line, ways = block
+        return _moments(Sides.of(plane, mask, cells, line), graph, *ways)
+
+    return blockwise(moments, (planes, graphs, mask, lines, ways))
+
+
+@sized_jit
+def _weights_of_blocks(planes, mask, moments, degree: int):
+    def weights(block):
+        plane, mask, moments = block
+        unit = plane.width ** len(plane.points)
+        # The fit knows differences from the point itself: the constant is the area times its value.
+        eta = moment_solve(plane.points, plane.weights, moments[1:, None], 1, degree)[0]
+        area = jnp.where(mask[0], unit * moments[0], 0)
+        eta = with_center(unit * eta)[0].at[0].add(area)
+        return jnp.where(mask, eta, 0), area
+
+    return blockwise(weights, (planes, mask, moments))
 
 
 class Graph(eqx.Module):
@@ -156,10 +185,15 @@ class Sides(eqx.Module):
 
     def chosen(self, which) -> Sides:
         """One of them at every place, by number."""
-        number = np.arange(len(self.on)).reshape(-1, *(1,) * (which.ndim - 1))
-        pick = lambda a: jnp.sum(jnp.where(number == which[:, None], a, 0), axis=1)
+        pick = lambda a: jnp.take_along_axis(a, which, axis=0)
         flat = jnp.stack([pick(a) for a in self.flat])
         return Sides(flat, pick(self.high), pick(self.offset), jnp.ones_like(which, bool))
+
+    def repeated(self, times: int) -> Sides:
+        """All of them several times."""
+        flat = jnp.concatenate([self.flat] * times, axis=1)
+        rest = (jnp.concatenate([a] * times) for a in (self.high, self.offset, self.on))
+        return Sides(flat, *rest)
 
     def miss(self, graph: Graph, q):
         """How far the points of the surface over q are beyond them, and the slope of that."""
@@ -168,20 +202,17 @@ class Sides(eqx.Module):
         return beyond, self.flat + slope * self.high
 
 
-def _moments(plane: TangentPlane, mask, graph: Graph, cells: int, outward):
-    r"""$\int q^\gamma\,dA$ over each cell for all monomials up to the degree; is it closed?"""
-    sides = Sides.of(plane, mask, cells, outward)
-    degree = graph.degree
-    nodes = degree // 2 + 1
-    find = _ways_of_curve if graph.dim == 1 else functools.partial(_ways, nodes=nodes)
-    ends, measure, closed, of_ways = find(sides, graph)
+def _moments(sides: Sides, graph: Graph, ends, measure, which):
+    r"""$\int q^\gamma\,dA$ over a cell for all monomials up to the degree."""
+    degree, nodes = graph.degree, _nodes(graph)
+    sides = sides.repeated(nodes) if which is None else sides.chosen(which)
 
     def newton(length, sides, graph, ends):
         beyond, slope = sides.miss(graph, length * ends)
         rate = jax.lax.stop_gradient(jnp.sum(slope * ends, axis=0))
         return length - beyond / jnp.where(rate > 0, rate, 1)
 
-    length = _root(newton, jnp.ones_like(measure), of_ways(sides), graph, ends)
+    length = _root(newton, jnp.ones_like(measure), sides, graph, ends)
     ends = length * ends
     measure = measure * length**graph.dim
 
@@ -195,29 +226,36 @@ def _moments(plane: TangentPlane, mask, graph: Graph, cells: int, outward):
         square = square + jnp.tensordot(powers[:-1].T, along, 1) ** 2
     sums = jnp.tensordot(powers * np.array(share), jnp.sqrt(square), 1) * measure
     found = [jnp.sum(row * total, axis=1) for row, total in zip(rows, sums)]
-    return jnp.concatenate(found), closed
+    return jnp.concatenate(found)
 
 
-def _ways(sides: Sides, graph: Graph, nodes: int):
-    """Ways from the point to the sides of its cell, `nodes` to each.
+def _nodes(graph: Graph) -> int:
+    """Of Gauss's rule: exact for the polynomials of the surface."""
+    return graph.degree // 2 + 1
+
+
+def _ways(sides: Sides, graph: Graph):
+    """Some ways from the point to each side of its cell.
 
     Returns:
-        Their ends if the sides were straight; what each stands for; whether the cell is closed;
-        and what gives each way its side.
+        Their ends if the sides were straight, what each stands for, and None, as they come in the
+        order of the sides; and whether the cell is closed.
     """
     flat, offset, on = jax.lax.stop_gradient((sides.flat, sides.offset, sides.on))
     # Side j is a_j + t c_j with c_j perpendicular to d_j, of which all others cut off a part.
     squared = jnp.sum(flat**2, axis=0)
     foot = offset / jnp.where(squared > 0, squared, 1)
-    dot = flat[0][:, None] * flat[0] + flat[1][:, None] * flat[1]
-    cross = flat[0][:, None] * flat[1] - flat[1][:, None] * flat[0]
-    room = offset - foot[:, None] * dot
-    other = ~np.eye(len(on), dtype=bool).reshape(len(on), len(on), *(1,) * (on.ndim - 1)) & on
+    # The cutting side first, the side that is cut second: sums over other axes than first are slow.
+    dot = flat[0] * flat[0][:, None] + flat[1] * flat[1][:, None]
+    cross = flat[0] * flat[1][:, None] - flat[1] * flat[0][:, None]
+    room = offset[:, None] - foot * dot
+    other = ~np.eye(len(on), dtype=bool).reshape(len(on), len(on), *(1,) * (on.ndim - 1))
+    other = other & on[:, None]
     at = room / jnp.where(cross == 0, 1, cross)
     before = jnp.where(other & (cross < 0), at, -jnp.inf)
     after = jnp.where(other & (cross > 0), at, jnp.inf)
-    none = jnp.any(other & (cross == 0) & (room < 0), axis=1)
-    low, high = jnp.max(before, axis=1), jnp.min(after, axis=1)
+    none = jnp.any(other & (cross == 0) & (room < 0), axis=0)
+    low, high = jnp.max(before, axis=0), jnp.min(after, axis=0)
     used = on & (squared > 0) & (low < high) & ~none
     bounded = jnp.isfinite(low) & jnp.isfinite(high)
 
@@ -234,30 +272,21 @@ def _ways(sides: Sides, graph: Graph, nodes: int):
 
         return jnp.where(used & bounded, _root(newton, q, sides, sides.chosen(cutter), graph), 0)
 
-    first = corner(low, jnp.argmax(before, axis=1))
-    last = corner(high, jnp.argmin(after, axis=1))
+    first = corner(low, jnp.argmax(before, axis=0))
+    last = corner(high, jnp.argmin(after, axis=0))
     turn = first[0] * last[1] - first[1] * last[0]
     # No point beyond the neighbours looked at can have a part of what is nearer to this one.
     reach = jnp.max(jnp.where(used, jnp.sum(last**2, axis=0), 0), axis=0)
     farthest = jnp.max(jnp.where(on & (offset > 0), squared, 0), axis=0)
     closed = jnp.all(~used | bounded, axis=0) & jnp.any(used, axis=0)
     closed = closed & (4 * reach <= farthest)
-    share, weights = _gauss(nodes, 0)
+    share, weights = _gauss(_nodes(graph), 0)
     ends = jnp.concatenate([first + x * (last - first) for x in share], axis=1)
-    measure = jnp.concatenate([w * turn for w in weights])
-
-    def of_ways(sides):
-        flat = jnp.concatenate([sides.flat] * nodes, axis=1)
-        high, offset, on = (
-            jnp.concatenate([a] * nodes) for a in (sides.high, sides.offset, sides.on)
-        )
-        return Sides(flat, high, offset, on)
-
-    return ends, measure, closed, of_ways
+    return (ends, jnp.concatenate([w * turn for w in weights]), None), closed
 
 
-def _ways_of_curve(sides: Sides, graph: Graph):
-    """The same for a curve, with one way to either side."""
+def _ways_of_curve(sides: Sides):
+    """The same for a curve, with one way to either side, and the numbers of these."""
     # The product of an end and the way to it does not depend on the end.
     flat, offset, on = jax.lax.stop_gradient((sides.flat[0], sides.offset, sides.on))
     at = offset / jnp.where(flat == 0, 1, flat)
@@ -267,7 +296,7 @@ def _ways_of_curve(sides: Sides, graph: Graph):
     which = jnp.stack([jnp.argmax(before, axis=0), jnp.argmin(after, axis=0)])
     closed = jnp.all(jnp.isfinite(ends), axis=0)
     ends = jnp.where(jnp.isfinite(ends), ends, 0)
-    return ends[None], jnp.abs(ends), closed, lambda sides: sides.chosen(which)
+    return (ends[None], jnp.abs(ends), which), closed
 
 
 def _root(newton: Callable, start, *known):

@@ -212,7 +212,7 @@ def test_another_number_of_points_shares_the_long_program():
     js.laplace_beltrami(clouds[0], lists[0], method=METHOD)
     with count_compilations() as names:
         js.laplace_beltrami(clouds[1], lists[1], method=METHOD)
-    assert {"jit(_in_blocks)", "jit(_out_of_blocks)"} <= set(names), names
+    assert {"jit(blocks_of)", "jit(rows_of)"} <= set(names), names
     assert len(names) < 8 and "jit(_weights_of_blocks)" not in names, names
 
 

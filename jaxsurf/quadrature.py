@@ -152,7 +152,7 @@ def _polynomial(coefficients: list[Array], rows: list[Array]):
 
 def _places(matrix: np.ndarray, a):
     """A matrix with one entry in a row times a vector over the basis."""
-    power = matrix.max(axis=1).reshape(-1, *(1,) * (a.ndim - 1))
+    power = matrix.max(axis=1).reshape(-1, *(1,) * (a.ndim - 1)).astype(a.dtype)
     return a[matrix.argmax(axis=1)] * power
 
 
@@ -218,13 +218,13 @@ def _moments(sides: Sides, graph: Graph, ends, measure, which):
 
     # Along a way each monomial is a power.
     rows = monomials_by_degree(ends, degree)
-    at, share = _gauss(nodes, graph.dim - 1)
-    powers = np.array(at) ** np.arange(degree + 1)[:, None]
+    at, share = (np.array(a, length.dtype) for a in _gauss(nodes, graph.dim - 1))
+    powers = at ** np.arange(degree + 1)[:, None].astype(length.dtype)
     square = jnp.ones((nodes, *length.shape), length.dtype)
     for slope in graph.slopes:
         along = jnp.stack([_polynomial([c], [row]) for c, row in zip(slope, rows)])
         square = square + jnp.tensordot(powers[:-1].T, along, 1) ** 2
-    sums = jnp.tensordot(powers * np.array(share), jnp.sqrt(square), 1) * measure
+    sums = jnp.tensordot(powers * share, jnp.sqrt(square), 1) * measure
     found = [jnp.sum(row * total, axis=1) for row, total in zip(rows, sums)]
     return jnp.concatenate(found)
 

@@ -115,9 +115,7 @@ class Discretization(eqx.Module):
     @property
     def divergence(self) -> Stencil:
         """Divergence along the surface, see `surface_divergence`."""
-        gradient = self.gradient
-        known = (gradient.diagnostics, gradient.border)
-        return Stencil(gradient.indices, gradient.weights, (), (self.cloud.dim,), *known)
+        return operators.divergence_of(self.gradient)
 
     @property
     def biharmonic(self) -> Composition:
@@ -183,7 +181,7 @@ class Discretization(eqx.Module):
 
     # --- integrals -------------------------------------------------------------------------
 
-    @property
+    @_Kept
     def areas(self) -> Float[Array, " n"]:
         r"""Weights $a_i$ with $\sum_i a_i u(x_i) \approx \int_S u\,dS$, `(n,)`, in length^(d-1).
 
@@ -198,10 +196,6 @@ class Discretization(eqx.Module):
             ValueError: the cell of a point is not closed by its neighbours (named by index), as
                 on a border that is not marked.
         """
-        return self._areas[0]
-
-    @_Kept
-    def _areas(self) -> tuple[Float[Array, " n"], Array]:
         degree = self.method.polynomial_degree
         need = polynomial_count(self.cloud.dim - 1, degree)
         if self.neighbors.k < need:
@@ -214,7 +208,7 @@ class Discretization(eqx.Module):
             conormals = self.border.conormals(self.cloud)
             outward = jnp.zeros_like(self.cloud.points).at[self.border.points].set(conormals)
         for cells in (_CELLS, self.neighbors.k):
-            weights, _, closed = cell_weights(self.cloud, self.neighbors, degree, cells, outward)
+            weights, closed = cell_weights(self.cloud, self.neighbors, degree, cells, outward)
             if not is_concrete(closed) or bool(closed.all()):
                 break
         if is_concrete(closed):
@@ -224,7 +218,7 @@ class Discretization(eqx.Module):
                 "border of the surface (`boundary`), or choose more neighbours"
             )
             raise_at(bad, text, np.asarray(self.neighbors.mask).sum(axis=1))
-        return _summed(weights, self.neighbors.indices.T), closed
+        return _summed(weights, self.neighbors.indices.T)
 
     def integrate(self, u: Float[Array, "n *c"]) -> Float[Array, "*c"]:
         r"""$\int_S u\,dS$ of a field or of each of its components."""
@@ -270,9 +264,7 @@ class Discretization(eqx.Module):
         if is_concrete(points, *jax.tree.leaves(self)):
             self._check_reach(points, centers)
         degree = self.method.polynomial_degree
-        slots, weights, _ = interpolation_weights(
-            self.cloud, self.neighbors, degree, points, centers
-        )
+        slots, weights = interpolation_weights(self.cloud, self.neighbors, degree, points, centers)
         return _interpolated(weights, slots, u)
 
     def _check_reach(self, points, centers) -> None:
@@ -326,19 +318,21 @@ class Discretization(eqx.Module):
                 f"points have shape {points.shape}, expected {self.cloud.points.shape}"
             )
         finite(points, "points")
-        found, stretch = _carried(self.gradient, self.cloud.normals, self.cloud.points, points)
-        if self.cloud.active is not None:
-            found = jnp.where(self.cloud.active[:, None], found, self.cloud.normals)
-        if normals is None:
-            normals = found
-        spacing = self.cloud.spacing
-        if spacing is not None:
-            spacing = spacing * stretch ** (1 / (self.cloud.dim - 1))
+        active, spacing = self.cloud.active, self.cloud.spacing
+        if normals is None or spacing is not None:
+            old = self.cloud
+            carried, stretch = _carried(self.gradient, old.normals, old.points, points)
+            if normals is None:
+                normals = carried
+                if active is not None:
+                    normals = jnp.where(active[:, None], carried, old.normals)
+            if spacing is not None:
+                spacing = spacing * stretch ** (1 / (old.dim - 1))
         cloud = PointCloud(
             points,
             normals,
             boundary=self.cloud.boundary,
-            active=self.cloud.active,
+            active=active,
             spacing=spacing,
         )
         surface = Discretization(cloud, self.neighbors, self.method, self.border)
@@ -346,17 +340,13 @@ class Discretization(eqx.Module):
             surface.check()
         return surface
 
-    @property
+    @_Kept
     def code(self) -> Int[Array, " n"]:
         """What is wrong with each point: what would be an error outside `jit`, as a number.
 
         0: nothing. 1: its position or normal is not finite. 2: the normal of a neighbour next to it
         points to the other side. 3: its stencil is degenerate.
         """
-        return self._code
-
-    @_Kept
-    def _code(self) -> Int[Array, " n"]:
         diagnostics = self.laplacian.diagnostics
         assert diagnostics is not None
         code = _judged(self.cloud, self.neighbors, diagnostics.residual)

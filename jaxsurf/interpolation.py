@@ -45,8 +45,8 @@ def interpolation_weights(
     degree: int,
     points: Float[Array, "m d"],
     centers: Int[Array, " m"],
-) -> tuple[Int[Array, "k m"], Float[Array, "k m"], Float[Array, " m"]]:
-    """Neighbours of the points next to these, their weights, and the residuals of the fits.
+) -> tuple[Int[Array, "k m"], Float[Array, "k m"]]:
+    """Neighbours of the points next to these, and their weights.
 
     Over the tangent plane of its centre each field is the polynomial that fits the neighbours and
     passes through the centre; it is read off where the point stands above that plane.
@@ -55,8 +55,8 @@ def interpolation_weights(
     lists = Rows(neighbors.indices[centers], neighbors.mask[centers], radius)
     blocks = blocks_of(cloud, lists, centers, _BATCH)
     at = in_blocks((points - cloud.points[centers]).T, _BATCH)
-    weights, residual = rows_of(_of_blocks(blocks, at, degree), len(points))
-    return lists.indices.T, weights, residual
+    weights, _ = rows_of((_of_blocks(blocks, at, degree), None), len(points))
+    return lists.indices.T, weights
 
 
 @sized_jit
@@ -66,10 +66,7 @@ def _of_blocks(blocks, offsets, degree: int):
         plane = TangentPlane.of(around, degree)
         place = jnp.sum(plane.tangents * offset, axis=1) / plane.width
         wanted = monomials(place, degree)[1:, None]
-        found = moment_solve(plane.points, plane.weights, wanted, 1, degree)
-        eta = with_center(found[0])[0].at[0].add(1)
-        # A place on the point itself asks for nothing: no residual to be measured by.
-        residual = jnp.where(jnp.any(wanted != 0, axis=(0, 1)), found[2], 0)
-        return jnp.where(around.mask, eta, 0), residual
+        eta = moment_solve(plane.points, plane.weights, wanted, 1, degree)[0]
+        return jnp.where(around.mask, with_center(eta)[0].at[0].add(1), 0)
 
     return blockwise(weights, (blocks, offsets))

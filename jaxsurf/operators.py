@@ -128,9 +128,13 @@ def surface_divergence(
         >>> bool(jnp.abs(js.surface_divergence(cloud)(cloud.normals) - 1).max() < 0.01)
         True
     """
-    gradient = build(cloud, neighbors, method, Gradient(), throw)
-    weights, known = gradient.weights, (gradient.diagnostics, gradient.border)
-    return Stencil(gradient.indices, weights, (), (cloud.dim,), *known)
+    return divergence_of(build(cloud, neighbors, method, Gradient(), throw))
+
+
+def divergence_of(gradient: Stencil) -> Stencil:
+    """The divergence, which has the weights of the gradient."""
+    known = (gradient.diagnostics, gradient.border)
+    return Stencil(gradient.indices, gradient.weights, (), gradient.out_shape, *known)
 
 
 def directional_derivative(

@@ -41,8 +41,8 @@ def cell_weights(
     degree: int,
     cells: int,
     outward: Float[Array, "n d"] | None,
-) -> tuple[Float[Array, "k n"], Float[Array, " n"], Bool[Array, " n"]]:
-    """Weights of the neighbours in the integral over each cell, its area, and whether it is closed.
+) -> tuple[Float[Array, "k n"], Bool[Array, " n"]]:
+    """Weights of the neighbours in the integral over each cell, and whether it is closed.
 
     Args:
         degree: of the polynomials.
@@ -50,7 +50,7 @@ def cell_weights(
         outward: conormals where the surface ends, zero elsewhere.
 
     Returns:
-        Weights `(k, n)`; areas; whether each cell is bounded by neighbours so near that no other
+        Weights `(k, n)`; whether each cell is bounded by neighbours so near that no other
         point can have a part of it.
     """
     blocks = blocks_of(cloud, neighbors, jnp.arange(cloud.n), _BATCH)
@@ -61,9 +61,9 @@ def cell_weights(
     planes, graphs = _surfaces(blocks, degree)
     ways, closed = _ways_of_blocks(planes, graphs, mask, lines, cells)
     moments = _moments_of_blocks(planes, graphs, mask, lines, ways, cells)
-    weights, areas = _weights_of_blocks(planes, mask, moments, degree)
-    weights, (areas, closed) = rows_of((weights, (areas, closed)), cloud.n)
-    return weights, areas, closed | ~neighbors.mask[:, 0]
+    weights = _weights_of_blocks(planes, mask, moments, degree)
+    weights, closed = rows_of((weights, closed), cloud.n)
+    return weights, closed | ~neighbors.mask[:, 0]
 
 
 @sized_jit
@@ -105,7 +105,7 @@ def _weights_of_blocks(planes, mask, moments, degree: int):
         eta = moment_solve(plane.points, plane.weights, moments[1:, None], 1, degree)[0]
         area = jnp.where(mask[0], unit * moments[0], 0)
         eta = with_center(unit * eta)[0].at[0].add(area)
-        return jnp.where(mask, eta, 0), area
+        return jnp.where(mask, eta, 0)
 
     return blockwise(weights, (planes, mask, moments))
 

@@ -6,8 +6,6 @@ Section 3 (Algorithms 1 and 2) for surfaces.
 
 from __future__ import annotations
 
-import math
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -15,6 +13,7 @@ from jaxtyping import Array, Float
 from .kernels import gaussian, taper
 from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive, with_center
 from .moments import moment_solve
+from .monomials import polynomial_count
 from .targets import AbstractTarget, Laplacian
 
 
@@ -66,7 +65,7 @@ class DCPSE(AbstractMethod):
         # Fields are constant along the normal, so that only the polynomials of the tangent
         # directions count.
         _, high = _degrees(target.order, self.order)
-        return math.comb(dim - 1 + high, high)
+        return polynomial_count(dim - 1, high)
 
     @property
     def batch_size(self):
@@ -130,7 +129,7 @@ class FlatDCPSE(AbstractMethod):
 
     def basis_size(self, dim, target):
         _, high = _degrees(target.order, self.order)
-        return math.comb(dim + high, high)
+        return polynomial_count(dim, high)
 
     @property
     def batch_size(self):

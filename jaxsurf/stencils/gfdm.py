@@ -5,13 +5,12 @@ Suchde, Kuhnert, J. Comput. Phys. (2019), Section 4.1, eqs. (18) to (27).
 
 from __future__ import annotations
 
-import math
-
 import equinox as eqx
 import jax.numpy as jnp
 
 from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive, with_center
 from .moments import moment_solve
+from .monomials import polynomial_count
 from .plane import TangentPlane
 from .targets import AbstractTarget
 
@@ -61,7 +60,7 @@ class GFDM(AbstractMethod):
                 f"for derivatives of order {target.order}, and so for the Laplacian by which "
                 "neighbours are chosen"
             )
-        return math.comb(dim - 1 + self.degree, self.degree)
+        return polynomial_count(dim - 1, self.degree)
 
     @property
     def batch_size(self):
@@ -78,8 +77,8 @@ class GFDM(AbstractMethod):
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
         plane = TangentPlane.of(neighborhood, self.degree, width=self.width, support=self.support)
         b = jnp.asarray(target.moments(len(plane.points), 1, self.degree), plane.points.dtype)
-        found = moment_solve(plane.points, plane.weights, b, 1, self.degree)
-        eta, condition, residual = found
+        solved = moment_solve(plane.points, plane.weights, b, 1, self.degree)
+        eta, condition, residual = solved
         eta = with_center(target.in_units(eta, plane.width, len(plane.points)))
         diagnostics = Diagnostics.of(neighborhood, condition, residual, plane.radius, 0)
         return target.assemble(eta, plane.tangents), diagnostics

@@ -88,13 +88,8 @@ def _moment_solve_jvp(low, high, primals, tangents):
     x, w, b = primals
     dx, dw, db = tangents
     (eta, condition, residual), (v, start, solve, a, s) = _solve(x, w, b, low, high)
-    # dV a is the gradient of the polynomial s along dx; dV^T g the same matrices transposed.
-    axes = [(d[:, start:], dx_i) for d, dx_i in zip(differentiation(len(x), high), dx)]
-    ds = sum(systems.combine(systems.transform(d, a), v) * dx_i for d, dx_i in axes)
-    g = dw * s + w * ds
-    rhs = systems.moments(v[start:], g)
-    for d, dx_i in axes:
-        rhs = systems.add(rhs, systems.transform(d.T, systems.moments(v, eta * dx_i)))
+    g = dw * s + w * _moved(a, v, dx, start, high)
+    rhs = _add_moved_moments(systems.moments(v[start:], g), eta, v, dx, start, high)
     if b.ndim > 2:
         rhs = systems.add(rhs, [-row for row in db] if isinstance(rhs, list) else -db)
     d_eta = g - w * systems.combine(solve(rhs), v[start:])
@@ -134,13 +129,22 @@ def _polynomial_fit_jvp(low, high, primals, tangents):
     out, (v, start, solve) = _fit(x, w, values, low, high)
     a = list(out) if isinstance(v, list) else out
     left = values - systems.combine(a, v[start:])
-    axes = [(d[:, start:], dx_i) for d, dx_i in zip(differentiation(len(x), high), dx)]
-    slope = sum(systems.combine(systems.transform(d, a), v) * dx_i for d, dx_i in axes)
-    rhs = systems.moments(v[start:], dw * left + w * (dz - slope))
-    for d, dx_i in axes:
-        rhs = systems.add(rhs, systems.transform(d.T, systems.moments(v, w * left * dx_i)))
-    da = solve(rhs)
+    g = dw * left + w * (dz - _moved(a, v, dx, start, high))
+    da = solve(_add_moved_moments(systems.moments(v[start:], g), w * left, v, dx, start, high))
     return out, (jnp.stack(da) if isinstance(v, list) else da)
+
+
+def _moved(a, v, dx, start, high):
+    """dV a: the gradient of the polynomials with coefficients a, along dx."""
+    matrices = differentiation(len(dx), high)[:, :, start:]
+    return sum(systems.combine(systems.transform(d, a), v) * dx_i for d, dx_i in zip(matrices, dx))
+
+
+def _add_moved_moments(rhs, eta, v, dx, start, high):
+    """A right-hand side plus dV^T eta: the same matrices transposed."""
+    for d, dx_i in zip(differentiation(len(dx), high)[:, :, start:], dx):
+        rhs = systems.add(rhs, systems.transform(d.T, systems.moments(v, eta * dx_i)))
+    return rhs
 
 
 @functools.cache

@@ -17,7 +17,6 @@ class TangentPlane(eqx.Module):
 
     Args:
         tangents: orthonormal directions of the plane.
-        normal: of the centre.
         points: coordinates of the neighbours along the tangents.
         heights: their coordinates along the normal.
         weights: of the fit.
@@ -26,7 +25,6 @@ class TangentPlane(eqx.Module):
     """
 
     tangents: Float[Array, "t d *p"]
-    normal: Float[Array, "d *p"]
     points: Float[Array, "t k *p"]
     heights: Float[Array, "k *p"]
     weights: Float[Array, "k *p"]
@@ -44,7 +42,7 @@ class TangentPlane(eqx.Module):
         along = [dot(around.offsets, axis[None]) / unit for axis in frame]
         weights = gaussian(around.squared, unit, radius, around.mask)
         points = jnp.stack(along[:-1])
-        return cls(frame[:-1], frame[-1], points, along[-1], weights, unit, radius)
+        return cls(frame[:-1], points, along[-1], weights, unit, radius)
 
     def surface(self, degree: int) -> Float[Array, "m *p"]:
         """Coefficients of the surface as a graph over the plane, of degrees 1 to `degree`."""

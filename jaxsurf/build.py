@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -112,7 +111,7 @@ def stencil_weights(
     """
     rows = jnp.arange(cloud.n) if rows is None else rows
     blocks = blocks_of(cloud, neighbors, rows, method.batch_size)
-    return rows_of(_weights_of_blocks(blocks, method, target), len(rows))
+    return rows_of(*_weights_of_blocks(blocks, method, target), len(rows))
 
 
 @sized_jit
@@ -143,10 +142,10 @@ def neighborhood(block) -> Neighborhood:
     return Neighborhood(offsets, jnp.stack(normals, axis=1), mask, radius)
 
 
-@eqx.filter_jit
-def rows_of(found, count: int):
+@sized_jit
+def rows_of(weights, others, count: int):
     """Weights, with the slots first, and what else was found of the rows, out of their blocks."""
-    weights, others = jax.tree.map(lambda a: out_of_blocks(a, count), found)
+    weights, others = jax.tree.map(lambda a: out_of_blocks(a, count), (weights, others))
     return jnp.moveaxis(weights, -2, 0), others
 
 
@@ -267,7 +266,7 @@ def _check_sizes(cloud, neighbors, method, target, throw) -> None:
 def _check(stencil: Stencil, neighbors, method, target, dim) -> None:
     diagnostics = stencil.diagnostics
     assert diagnostics is not None
-    on = np.asarray(neighbors.mask[:, 0])
+    on = np.asarray(neighbors.mask)[:, 0]
     count, residual = np.asarray(diagnostics.count), np.asarray(diagnostics.residual)
     bad = np.flatnonzero(on & ~(residual < residual_tolerance(residual.dtype)))
     if bad.size:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextvars
 import functools
 from collections.abc import Callable
 
@@ -10,10 +11,16 @@ import numpy as np
 
 from .arguments import is_concrete
 
-# Down to half the time to compile, and up to 1.4 times that to run.
+# Down to half the time to compile, and up to twice that to run (`is_quick`: simpler forms).
 _QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 # Numbers given to a program, in all its arrays, below which it is small.
 _SMALL = 2_000_000
+_quickly = contextvars.ContextVar("quickly", default=False)
+
+
+def is_quick() -> bool:
+    """Whether what is being traced is to be compiled quickly: code may then choose its form."""
+    return _quickly.get()
 
 
 def sized_jit(f: Callable) -> Callable:
@@ -27,9 +34,16 @@ def sized_jit(f: Callable) -> Callable:
         leaves = [other if array is None else array for array, other in zip(arrays, others)]
         return f(*jax.tree.unflatten(structure, leaves))
 
-    program.__name__ = f.__name__
-    compiled = functools.partial(jax.jit, program, static_argnums=(1, 2))
-    thorough, quick = compiled(), compiled(compiler_options=_QUICK)
+    def quick_program(*args):
+        token = _quickly.set(True)
+        try:
+            return program(*args)
+        finally:
+            _quickly.reset(token)
+
+    program.__name__ = quick_program.__name__ = f.__name__
+    thorough = jax.jit(program, static_argnums=(1, 2))
+    quick = jax.jit(quick_program, static_argnums=(1, 2), compiler_options=_QUICK)
 
     @functools.wraps(f)
     def call(*args):

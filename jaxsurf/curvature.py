@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from .arguments import instance
 from .cloud import PointCloud
+from .compiling import sized_jit
 from .frames import frames_of
 from .neighbors import Neighbors
 from .operators import laplace_beltrami, surface_gradient
@@ -49,12 +50,13 @@ def shape_tensor(
         True
     """
     gradient = surface_gradient(cloud, neighbors, method=method)
-    return tensor_of(gradient(cloud.normals), cloud.normals)
+    return tensor_of(gradient, cloud.normals)
 
 
-@jax.jit
-def tensor_of(tensor, n):
-    """The shape tensor from the gradient of the normals."""
+@sized_jit
+def tensor_of(gradient, n):
+    """The shape tensor: the gradient of the normals, made symmetric and tangential."""
+    tensor = gradient(n)
     project = jnp.eye(n.shape[1], dtype=n.dtype) - n[:, :, None] * n[:, None]
     tensor = jnp.einsum("nab,nbc,ncd->nad", project, tensor, project)
     return (tensor + tensor.mT) / 2

@@ -137,8 +137,11 @@ class Discretization(eqx.Module):
         """Laplacian and gradient from one factorisation of the moment matrices."""
         both = self._build(Joint((Laplacian(), Gradient())))
         known = (both.diagnostics, both.border)
-        first = Stencil(both.indices, both.weights[:, 0], (), (), *known)
-        return first, Stencil(both.indices, both.weights[:, 1:], (self.cloud.dim,), (), *known)
+        laplacian, gradient = _first_and_others(both.weights)
+        return (
+            Stencil(both.indices, laplacian, (), (), *known),
+            Stencil(both.indices, gradient, (self.cloud.dim,), (), *known),
+        )
 
     @_Kept
     def _laplacian(self) -> Stencil:
@@ -156,7 +159,7 @@ class Discretization(eqx.Module):
     @property
     def shape_tensor(self) -> Float[Array, "n d d"]:
         """See `shape_tensor`."""
-        return curvature.tensor_of(self.gradient(self.cloud.normals), self.cloud.normals)
+        return curvature.tensor_of(self.gradient, self.cloud.normals)
 
     @property
     def mean_curvature(self) -> Float[Array, " n"]:
@@ -398,6 +401,11 @@ def discretize(
     if cloud.boundary is not None and np.asarray(cloud.boundary).any():
         border = find_border(cloud)
     return Discretization(cloud, neighbors, method, border)
+
+
+@jax.jit
+def _first_and_others(weights):
+    return weights[:, 0], weights[:, 1:]
 
 
 @jax.jit

@@ -55,7 +55,7 @@ def interpolation_weights(
     lists = Rows(neighbors.indices[centers], neighbors.mask[centers], radius)
     blocks = blocks_of(cloud, lists, centers, _BATCH)
     at = in_blocks((points - cloud.points[centers]).T, _BATCH)
-    weights, _ = rows_of((_of_blocks(blocks, at, degree), None), len(points))
+    weights, _ = rows_of(_of_blocks(blocks, at, degree), None, len(points))
     return lists.indices.T, weights
 
 

@@ -62,7 +62,7 @@ def cell_weights(
     ways, closed = _ways_of_blocks(planes, graphs, mask, lines, cells)
     moments = _moments_of_blocks(planes, graphs, mask, lines, ways, cells)
     weights = _weights_of_blocks(planes, mask, moments, degree)
-    weights, closed = rows_of((weights, closed), cloud.n)
+    weights, closed = rows_of(weights, closed, cloud.n)
     return weights, closed | ~neighbors.mask[:, 0]
 
 

@@ -107,16 +107,19 @@ class Level(eqx.Module):
         return self.inverse.shape[0]
 
     def smooth(self, x, b):
-        for factor in self.damping:
-            x = x + factor * self.inverse * (b - self.matrix(x))
-        return x
+        """The smoother from x. Its steps are a loop: the matrix is compiled once."""
+        step = lambda x, factor: (x + factor * self.inverse * (b - self.matrix(x)), None)
+        return jax.lax.scan(step, x, jnp.stack(self.damping))[0]
 
     def presmooth(self, b):
-        """The smoother from zero."""
-        x = self.damping[0] * self.inverse * b
-        for factor in self.damping[1:]:
-            x = x + factor * self.inverse * (b - self.matrix(x))
-        return x
+        """The smoother from zero, and the residual that it leaves."""
+
+        def step(carry, factor):
+            x, r = carry
+            x = x + factor * self.inverse * r
+            return (x, b - self.matrix(x)), None
+
+        return jax.lax.scan(step, (jnp.zeros_like(b), b), jnp.stack(self.damping))[0]
 
 
 class Multigrid(AbstractPreconditioner):
@@ -157,8 +160,8 @@ class Multigrid(AbstractPreconditioner):
         if depth == len(self.levels):
             return self.coarsest @ b
         level = self.levels[depth]
-        x = level.presmooth(b)
-        x = x + level.prolong(self._cycle(depth + 1, level.restrict(b - level.matrix(x))))
+        x, r = level.presmooth(b)
+        x = x + level.prolong(self._cycle(depth + 1, level.restrict(r)))
         return level.smooth(x, b)
 
     def transpose(self):

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from ..arguments import as_float, is_concrete, whole
 from ..boundary import Closure
+from ..compiling import sized_jit
 from ..stencils.stencil import AbstractOperator
 from .krylov import BiCGStab, scale_of, tolerances_as_arrays
 from .padded import matching_layout
@@ -127,7 +128,7 @@ def solve(
     return solution
 
 
-@eqx.filter_jit
+@sized_jit
 def _solve(rhs, operator, layout, conditions, preconditioner, solver, limits, mean_zero, throw):
     problem = (operator, layout, conditions, preconditioner, solver, limits, mean_zero, throw)
     if rhs.ndim == 1:

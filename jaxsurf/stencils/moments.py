@@ -76,7 +76,7 @@ def _solve(x, w, b, low, high):
 def _system(x, w, low, high):
     """All monomials, the number of those below the basis, the Gram matrix and its solver."""
     start = len(multi_indices(len(x), 0, low - 1))
-    small = len(multi_indices(len(x), low, high)) <= systems.SMALL
+    small = systems.is_small(len(multi_indices(len(x), low, high)))
     v: list[Array] | Array = monomial_rows(x, high) if small else monomials(x, high)
     gram = _gram(x, w, low, high)
     return v, start, gram, systems.factor(gram)
@@ -163,7 +163,7 @@ def _gather_table(dim: int, low: int, high: int) -> tuple[np.ndarray, np.ndarray
 
 def _gram(x, w, low, high):
     basis = multi_indices(len(x), low, high)
-    if len(basis) <= systems.SMALL:
+    if systems.is_small(len(basis)):
         place = position(len(x), 2 * high)
         sums = [jnp.sum(row, axis=0) for row in monomial_rows(x, 2 * high, w)]
         total = (basis[:, None] + basis).tolist()

@@ -20,6 +20,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from ..arguments import as_float, instance, is_array, is_concrete, mask, point_indices, raise_at
+from ..compiling import is_quick
 from .method import Diagnostics
 
 
@@ -411,6 +412,8 @@ def _sum_slots(weights, indices, values, contracted: int):
             total = add(i * _GROUP + q, total)
         return total
 
+    if is_quick():
+        return _scan_slots(weights, indices, values, contracted)
     groups, rest = divmod(len(indices), _GROUP)
     total = jax.lax.fori_loop(0, groups, add_group, _zero(weights, values, contracted))
     for slot in range(len(indices) - rest, len(indices)):

@@ -16,8 +16,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..compiling import is_quick
+
 # Up to this number of unknowns a system is small.
-SMALL = 15
+_SMALL = 15
+
+
+def is_small(unknowns: int) -> bool:
+    """Whether a system of so many takes the form that runs faster, and is compiled more slowly."""
+    return unknowns <= _SMALL and not is_quick()
 
 
 def combine(a, v):

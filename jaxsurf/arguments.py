@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import math
 import operator
+import re
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +30,23 @@ def raise_at(bad: np.ndarray, message: str, values: np.ndarray) -> None:
         text = message.format(i=where[0], v=values[where[0]])
         more = f" (and {where.size - 1} more)" if where.size > 1 else ""
         raise ValueError(text + more)
+
+
+def refuse(x: Array, bad: Array, message: str, values: Array) -> Array:
+    """The array, but an error where there is anything bad: now, or when a compiled program runs.
+
+    Args:
+        bad: one for each point; concrete, or traced under `jit`, `vmap` and `grad`.
+        message: with places {i} for the point and {v} for its value.
+
+    Raises:
+        ValueError: names the first bad point, its value, and how many there are. Compiled programs
+            cannot name them: theirs is an `EquinoxRuntimeError`.
+    """
+    if is_concrete(bad):
+        raise_at(np.asarray(bad), message, np.asarray(values))
+        return x
+    return eqx.error_if(x, bad, re.sub(r"\{[iv][^}]*\}", "(to be seen outside jit)", message))
 
 
 def as_float(x: Any, name: str = "array") -> Float[Array, "..."]:

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from . import curvature, operators
-from .arguments import as_float, finite, instance, is_concrete, raise_at
+from .arguments import as_float, finite, instance, is_concrete, raise_at, refuse
 from .borders import Border, find_border
 from .build import build, choose_neighbors, residual_tolerance
 from .cloud import PointCloud
-from .frames import frames_of
 from .interpolation import interpolation_weights, nearest_points
+from .motion import CODES, carried, judged
 from .neighbors import Neighbors
 from .quadrature import cell_weights
 from .stencils.dcpse import DCPSE
@@ -27,13 +27,6 @@ from .stencils.targets import Gradient, Joint, Laplacian
 
 # So many neighbours may bound a cell; where points are very uneven, all are tried.
 _CELLS = 24
-
-# What `Discretization.code` says of a point.
-_CODES = {
-    1: "its position or normal is not finite",
-    2: "the normal of a neighbour next to it points to the other side",
-    3: "its stencil is degenerate",
-}
 
 
 class _Kept:
@@ -210,17 +203,16 @@ class Discretization(eqx.Module):
         if self.border is not None:
             conormals = self.border.conormals(self.cloud)
             outward = jnp.zeros_like(self.cloud.points).at[self.border.points].set(conormals)
-        for cells in (_CELLS, self.neighbors.k):
-            weights, closed = cell_weights(self.cloud, self.neighbors, degree, cells, outward)
-            if not is_concrete(closed) or bool(closed.all()):
-                break
-        if is_concrete(closed):
-            bad = ~np.asarray(closed)
-            text = (
-                "the neighbours of point {i} do not close its cell, out of {v} of them: mark the "
-                "border of the surface (`boundary`), or choose more neighbours"
-            )
-            raise_at(bad, text, np.asarray(self.neighbors.mask).sum(axis=1))
+        args = (self.cloud, self.neighbors, degree)
+        weights, closed, residual = cell_weights(*args, _CELLS, outward)
+        if is_concrete(closed) and not closed.all():
+            weights, closed, residual = cell_weights(*args, self.neighbors.k, outward)
+        text = (
+            "the neighbours of point {i} do not close its cell, out of {v} of them: mark the "
+            "border of the surface (`boundary`), or choose more neighbours"
+        )
+        weights = refuse(weights, ~closed, text, jnp.sum(self.neighbors.mask, axis=1))
+        weights = _determined(weights, residual, degree)
         return _summed(weights, self.neighbors.indices.T)
 
     def integrate(self, u: Float[Array, "n *c"]) -> Float[Array, "*c"]:
@@ -264,26 +256,17 @@ class Discretization(eqx.Module):
             raise ValueError(f"points have shape {points.shape}, expected (m, {self.cloud.dim})")
         finite(points, "points")
         centers = nearest_points(self.cloud, points)
-        if is_concrete(points, *jax.tree.leaves(self)):
-            self._check_reach(points, centers)
-        degree = self.method.polynomial_degree
-        slots, weights = interpolation_weights(self.cloud, self.neighbors, degree, points, centers)
-        return _interpolated(weights, slots, u)
-
-    def _check_reach(self, points, centers) -> None:
-        x, centers = np.asarray(self.cloud.points), np.asarray(centers)
-        distance = np.linalg.norm(np.asarray(points) - x[centers], axis=1)
-        lists, used = (
-            np.asarray(a)[centers] for a in (self.neighbors.indices, self.neighbors.mask)
-        )
-        reach = np.linalg.norm(np.where(used[:, :, None], x[lists], x[centers][:, None])
-                               - x[centers][:, None], axis=2).max(axis=1)  # fmt: skip
-        raise_at(
-            distance > reach,
+        distance, reach = _distance_and_reach(self.cloud, self.neighbors, points, centers)
+        text = (
             "points: {i} is {v:.3g} away from the nearest point of the cloud, farther than the "
-            "neighbours of that reach",
-            distance,
+            "neighbours of that reach"
         )
+        points = refuse(points, distance > reach, text, distance)
+        degree = self.method.polynomial_degree
+        slots, weights, residual = interpolation_weights(
+            self.cloud, self.neighbors, degree, points, centers
+        )
+        return _interpolated(_determined(weights, residual, degree), slots, u)
 
     def _field(self, u) -> Float[Array, "n *c"]:
         u = as_float(u, "field")
@@ -299,7 +282,7 @@ class Discretization(eqx.Module):
         r"""The same surface with its points elsewhere: same neighbours, border, mask and method.
 
         Args:
-            points: new positions, `(n, d)`.
+            points: new positions, `(n, d)`; switched-off ones stay where they are.
             normals: new unit normals; if None those of the tangents carried along by the motion,
                 $n \propto F t_1 \times F t_2$ with F the gradient of the new positions on the
                 surface as it was.
@@ -320,15 +303,17 @@ class Discretization(eqx.Module):
             raise ValueError(
                 f"points have shape {points.shape}, expected {self.cloud.points.shape}"
             )
-        finite(points, "points")
         active, spacing = self.cloud.active, self.cloud.spacing
+        if active is not None:
+            points = jnp.where(active[:, None], points, self.cloud.points)
+        finite(points, "points")
         if normals is None or spacing is not None:
             old = self.cloud
-            carried, stretch = _carried(self.gradient, old.normals, old.points, points)
+            ahead, stretch = carried(self.gradient, old.normals, old.points, points)
             if normals is None:
-                normals = carried
+                normals = ahead
                 if active is not None:
-                    normals = jnp.where(active[:, None], carried, old.normals)
+                    normals = jnp.where(active[:, None], ahead, old.normals)
             if spacing is not None:
                 spacing = spacing * stretch ** (1 / (old.dim - 1))
         cloud = PointCloud(
@@ -352,13 +337,13 @@ class Discretization(eqx.Module):
         """
         diagnostics = self.laplacian.diagnostics
         assert diagnostics is not None
-        code = _judged(self.cloud, self.neighbors, diagnostics.residual)
+        code = judged(self.cloud, self.neighbors, diagnostics.residual)
         return jax.lax.stop_gradient(code)
 
     def check(self) -> None:
         """Raise a ValueError that names the first point whose `code` is not 0; concrete only."""
         code = np.asarray(self.code)
-        names = np.array([_CODES.get(int(c), "") for c in code])
+        names = np.array([CODES.get(int(c), "") for c in code])
         raise_at(code != 0, "point {i}: {v}", names)
 
 
@@ -403,6 +388,30 @@ def discretize(
     return Discretization(cloud, neighbors, method, border)
 
 
+def _determined(weights, residual, degree: int):
+    """The weights of local polynomials that the neighbours determine."""
+    text = (
+        f"the neighbours of point {{i}} do not determine a polynomial of degree {degree}: relative "
+        "moment residual {v:.1e}"
+    )
+    return refuse(weights, ~(residual < residual_tolerance(residual.dtype)), text, residual)
+
+
+@jax.jit
+def _distance_and_reach(cloud, neighbors, points, centers):
+    """How far points are from those of the cloud next to them, and how far these's lists reach."""
+    x = jax.lax.stop_gradient(cloud.points)
+    center = x[centers]
+    away = jnp.where(
+        neighbors.mask[centers].T, _length(x[neighbors.indices[centers].T] - center), 0
+    )
+    return _length(jax.lax.stop_gradient(points) - center), jnp.max(away, axis=0)
+
+
+def _length(vectors):
+    return jnp.sqrt(jnp.sum(vectors**2, axis=-1))
+
+
 @jax.jit
 def _first_and_others(weights):
     return weights[:, 0], weights[:, 1:]
@@ -424,64 +433,3 @@ def _interpolated(weights, slots, u):
     add = lambda total, slot: (total + slot[0] * u[slot[1]], None)
     zero = jnp.zeros((slots.shape[1], *u.shape[1:]), jnp.result_type(weights, u))
     return jax.lax.scan(add, zero, (weights, slots))[0]
-
-
-# Each brings normals closer to where a rigid motion takes them, by the error of the gradient.
-_TURNS = 4
-
-
-@jax.jit
-def _carried(gradient, normals, before, after):
-    """Normals carried along by a motion of the points, and the factor it stretches areas by.
-
-    The gradient of the positions takes a tangent to itself but for its error, $F_0 t = A t + s n$.
-    So does that of the new positions, with the images in place of t and n; which A and s then tell.
-    """
-    tangents = frames_of(normals)[:, :-1]
-    images = [
-        jnp.einsum("nxs,nts->ntx", gradient(x - jnp.mean(x, axis=0)), tangents)
-        for x in (before, after)
-    ]
-    a = jnp.einsum("ntx,nux->ntu", images[0], tangents)
-    s = jnp.einsum("ntx,nx->nt", images[0], normals)
-    ahead = jnp.zeros_like(normals)
-    for _ in range(_TURNS):
-        normal = _crossed(_solved(a, images[1] - s[:, :, None] * ahead[:, None]))
-        length = jnp.sqrt(jnp.sum(normal**2, axis=1))
-        normal = normal / jnp.where(length > 0, length, 1)[:, None]
-        ahead = normal * (length ** (1 / (normals.shape[1] - 1)))[:, None]
-    return normal, length
-
-
-def _solved(a, b):
-    """Solutions of the 1 x 1 or 2 x 2 systems of all points."""
-    if a.shape[1] == 1:
-        return b / a
-    (p, q), (r, s) = jnp.moveaxis(a, 0, -1)
-    inverse = jnp.stack([jnp.stack([s, -q]), jnp.stack([-r, p])]) / (p * s - q * r)
-    return jnp.einsum("tun,nux->ntx", inverse, b)
-
-
-def _crossed(tangents):
-    """The normal of a plane or line of tangents, as long as they are large."""
-    if tangents.shape[1] == 1:
-        return jnp.stack([-tangents[:, 0, 1], tangents[:, 0, 0]], axis=1)
-    return jnp.cross(tangents[:, 0], tangents[:, 1])
-
-
-@jax.jit
-def _judged(cloud, neighbors, residual):
-    points, normals = cloud.points, cloud.normals
-    ill = ~jnp.all(jnp.isfinite(points) & jnp.isfinite(normals), axis=1)
-
-    def turned(found, slot):
-        index, used = slot
-        return found | (used & (jnp.sum(normals[index] * normals, axis=1) < 0)), None
-
-    # Of those farther away, other lists would leave out what has turned.
-    ring = 2 * points.shape[1] + 1
-    lists = (neighbors.indices[:, 1:ring].T, neighbors.mask[:, 1:ring].T)
-    folded = jax.lax.scan(turned, jnp.zeros(len(points), bool), lists)[0]
-    poor = ~(residual < residual_tolerance(residual.dtype))
-    code = jnp.where(ill, 1, jnp.where(folded, 2, jnp.where(poor, 3, 0)))
-    return jnp.where(neighbors.mask[:, 0], code, 0)

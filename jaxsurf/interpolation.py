@@ -45,8 +45,8 @@ def interpolation_weights(
     degree: int,
     points: Float[Array, "m d"],
     centers: Int[Array, " m"],
-) -> tuple[Int[Array, "k m"], Float[Array, "k m"]]:
-    """Neighbours of the points next to these, and their weights.
+) -> tuple[Int[Array, "k m"], Float[Array, "k m"], Float[Array, " m"]]:
+    """Neighbours of the points next to these, their weights, and the residuals of their moments.
 
     Over the tangent plane of its centre each field is the polynomial that fits the neighbours and
     passes through the centre; it is read off where the point stands above that plane.
@@ -55,8 +55,7 @@ def interpolation_weights(
     lists = Rows(neighbors.indices[centers], neighbors.mask[centers], radius)
     blocks = blocks_of(cloud, lists, centers, _BATCH)
     at = in_blocks((points - cloud.points[centers]).T, _BATCH)
-    weights, _ = rows_of(_of_blocks(blocks, at, degree), None, len(points))
-    return lists.indices.T, weights
+    return lists.indices.T, *rows_of(*_of_blocks(blocks, at, degree), len(points))
 
 
 @sized_jit
@@ -66,7 +65,7 @@ def _of_blocks(blocks, offsets, degree: int):
         plane = TangentPlane.of(around, degree)
         place = jnp.sum(plane.tangents * offset, axis=1) / plane.width
         wanted = monomials(place, degree)[1:, None]
-        eta = moment_solve(plane.points, plane.weights, wanted, 1, degree)[0]
-        return jnp.where(around.mask, with_center(eta)[0].at[0].add(1), 0)
+        eta, _, residual = moment_solve(plane.points, plane.weights, wanted, 1, degree)
+        return jnp.where(around.mask, with_center(eta)[0].at[0].add(1), 0), residual
 
     return blockwise(weights, (blocks, offsets))

@@ -41,8 +41,8 @@ def cell_weights(
     degree: int,
     cells: int,
     outward: Float[Array, "n d"] | None,
-) -> tuple[Float[Array, "k n"], Bool[Array, " n"]]:
-    """Weights of the neighbours in the integral over each cell, and whether it is closed.
+) -> tuple[Float[Array, "k n"], Bool[Array, " n"], Float[Array, " n"]]:
+    """Weights of the neighbours in the integral over each cell, and what may be wrong with it.
 
     Args:
         degree: of the polynomials.
@@ -51,7 +51,7 @@ def cell_weights(
 
     Returns:
         Weights `(k, n)`; whether each cell is bounded by neighbours so near that no other
-        point can have a part of it.
+        point can have a part of it; the relative moment residual of its weights.
     """
     blocks = blocks_of(cloud, neighbors, jnp.arange(cloud.n), _BATCH)
     lines = None if outward is None else in_blocks(outward.T, _BATCH)
@@ -61,9 +61,10 @@ def cell_weights(
     planes, graphs = _surfaces(blocks, degree)
     ways, closed = _ways_of_blocks(planes, graphs, mask, lines, cells)
     moments = _moments_of_blocks(planes, graphs, mask, lines, ways, cells)
-    weights = _weights_of_blocks(planes, mask, moments, degree)
-    weights, closed = rows_of(weights, closed, cloud.n)
-    return weights, closed | ~neighbors.mask[:, 0]
+    weights, residual = _weights_of_blocks(planes, mask, moments, degree)
+    weights, (closed, residual) = rows_of(weights, (closed, residual), cloud.n)
+    on = neighbors.mask[:, 0]
+    return weights, closed | ~on, jnp.where(on, residual, 0)
 
 
 @sized_jit
@@ -102,10 +103,10 @@ def _weights_of_blocks(planes, mask, moments, degree: int):
         plane, mask, moments = block
         unit = plane.width ** len(plane.points)
         # The fit knows differences from the point itself: the constant is the area times its value.
-        eta = moment_solve(plane.points, plane.weights, moments[1:, None], 1, degree)[0]
+        eta, _, residual = moment_solve(plane.points, plane.weights, moments[1:, None], 1, degree)
         area = jnp.where(mask[0], unit * moments[0], 0)
         eta = with_center(unit * eta)[0].at[0].add(area)
-        return jnp.where(mask, eta, 0)
+        return jnp.where(mask, eta, 0), residual
 
     return blockwise(weights, (planes, mask, moments))
 

@@ -1,5 +1,6 @@
 """`js.discretize`: operators kept, integrals of high order, interpolation, moved surfaces."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -249,6 +250,48 @@ def test_codes_say_what_would_be_an_error():
         surface.moved(folded)
     line = cloud.points * jnp.array([1.0, 0.0, 0.0]) + 0 * cloud.points
     assert code(line).any()
+
+
+def test_compiled_code_refuses_what_is_an_error_outside():
+    method = js.GFDM(degree=2)
+    end = js.graph(lambda x, y: 0.3 * x * y, (16, 16))
+    square = js.discretize(js.PointCloud(end.points, end.normals), method=method)
+    with pytest.raises(ValueError, match=r"neighbours of point \d+ do not close its cell"):
+        _ = square.areas
+    with pytest.raises(eqx.EquinoxRuntimeError, match="do not close its cell"):
+        eqx.filter_jit(lambda s: s.areas)(square)
+
+    torus = js.discretize(js.torus(400, R, r), method=method)
+    u, x = jnp.ones(400), torus.cloud.points
+    few = torus.neighbors.mask.at[7, 4:].set(False)
+    poor = js.Discretization(
+        torus.cloud, eqx.tree_at(lambda n: n.mask, torus.neighbors, few), method
+    )
+    at = eqx.filter_jit(lambda s, x: s.interpolate(u, x))
+    for surface, points, text in (
+        (torus, x.at[3].set(9.0), "away from the nearest point"),
+        (poor, x[5:9] + 1e-3, "do not determine a polynomial of degree 2"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            surface.interpolate(u, points)
+        with pytest.raises(eqx.EquinoxRuntimeError, match=text):
+            at(surface, points)
+
+
+def test_rows_that_are_off_may_hold_anything():
+    cloud = js.torus(400, R, r)
+    off = jnp.arange(400) % 3 == 0
+    surface = js.discretize(
+        js.PointCloud(cloud.points, cloud.normals, active=~off), method=js.GFDM(degree=2)
+    )
+    there = jnp.where(off[:, None], jnp.nan, 2 * cloud.points)
+    moved = surface.moved(there)
+    expected = surface.moved(2 * cloud.points)
+    assert not moved.code.any()
+    np.testing.assert_allclose(moved.areas, expected.areas, rtol=1e-12)
+    lost = jnp.where((jnp.arange(400) == 1)[:, None], jnp.nan, there)
+    with pytest.raises(ValueError, match="points is not finite at point 1"):
+        surface.moved(lost)
 
 
 @pytest.mark.core

@@ -120,21 +120,72 @@ def test_single_precision(name):
     assert error < SINGLE.get(name, 2e-4), error
 
 
+BORDERED = js.graph(lambda x, y: 0.3 * x * y, (14, 14))
+BORDER, NEAR = js.find_border(BORDERED), js.find_neighbors(BORDERED, k=24)
+SOURCE = np.array([7])
+
+
+def refitted(points, lists, _):
+    return js.refit_normals(points, squeezed(points).normals, lists, degree=2, iterations=3)
+
+
+def solved(points, lists, _):
+    """In the points of the operator and of its right-hand side."""
+    screened = js.laplace_beltrami(squeezed(points), lists, method=METHOD).scaled(-1.0).shifted(1.0)
+    preconditioner = js.jacobi(screened)
+    return js.solve(screened, points[:, 2], preconditioner=preconditioner, mean_zero=False).value
+
+
+def closed(points, _, near):
+    """In the points of a border and of those near it, through fluxes along conormals."""
+    bent = jnp.stack([points[:, 0], points[:, 1], 0.3 * points[:, 0] * points[:, 1]], axis=1)
+    normals = jnp.stack([-0.3 * points[:, 1], -0.3 * points[:, 0], 1 + 0 * points[:, 0]], axis=1)
+    normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+    cloud = js.PointCloud(bent, normals, boundary=BORDERED.boundary)
+    closure = js.close(cloud, js.neumann(BORDERED.boundary), neighbors=near, border=BORDER)
+    return closure(jnp.sin(bent @ jnp.asarray([1.0, 2.0, 1.5], points.dtype)))
+
+
+def distances(points, lists, _):
+    return js.geodesic_distance(squeezed(points), SOURCE, neighbors=lists, method=METHOD)
+
+
+def integral(points, lists, _):
+    surface = js.discretize(squeezed(points), lists, method=METHOD)
+    return surface.integrate(points[:, 2] ** 2)
+
+
+def in_time(points, lists, _):
+    laplacian = js.laplace_beltrami(squeezed(points), lists, method=METHOD)
+    problem = js.AdvectionDiffusionReaction(laplacian)
+    return js.integrate(problem, points[:, 2], t1=0.1, solver=js.RKC2(), dt0=0.05).ys[-1]
+
+
+def modes(points, lists, _):
+    return js.eigenmodes(js.laplace_beltrami(squeezed(points), lists, method=METHOD), 4).values
+
+
+OTHERS = {f.__name__: f for f in (refitted, solved, closed, distances, integral, in_time, modes)}
 # Largest errors of gradients, relative to the gradient in double precision.
 SINGLE_GRADIENTS = {"laplace_beltrami": 1e-3}
 
 
-@pytest.mark.parametrize("name", ["laplace_beltrami", "surface_gradient", "diffusion"])
+@pytest.mark.parametrize("name", [*OPERATORS, *CURVATURES, *OTHERS])
 def test_gradients_in_single_precision(name):
     """In the points (and normals that follow them), to 1e-2 of the gradient in 64 bits."""
+    points = BORDERED.points if name == "closed" else CLOUD.points
 
-    def total(points, lists):
-        return jnp.sum(values(name, squeezed(points), lists) ** 2)
+    def total(points, lists, near):
+        if name in OTHERS:
+            found = OTHERS[name](points, lists, near)
+        else:
+            found = values(name, squeezed(points), lists)
+        return jnp.vdot(jnp.cos(jnp.arange(found.size)).astype(found.dtype), found.ravel())
 
-    exact = jax.grad(total)(CLOUD.points, LISTS)
+    exact = jax.grad(total)(points, LISTS, NEAR)
     with jax.enable_x64(False):
-        lists = jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), LISTS)
-        found = jax.grad(total)(jnp.asarray(np.asarray(CLOUD.points), jnp.float32), lists)
+        lists, near = jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), (LISTS, NEAR))
+        found = jax.grad(total)(jnp.asarray(np.asarray(points), jnp.float32), lists, near)
         assert found.dtype == jnp.float32
     assert jnp.linalg.norm(exact) > 1e-2  # there is something to differentiate
     error = relative_error(np.asarray(found, float), exact)

@@ -59,7 +59,8 @@ class _Pair(eqx.Module):
             inverse,
             self.restrict,
             self.prolong,
-            chebyshev(self.radius),
+            # Its roots are of double precision, the cycle is not.
+            tuple(x.astype(self.radius.dtype) for x in chebyshev(self.radius)),
         )
 
 

@@ -69,7 +69,8 @@ def _solve(x, w, b, low, high):
     # The moments of eta are A a.
     found = systems.symmetric(gram, a)
     error = jnp.abs((jnp.stack(found) if small else found) - b)
-    residual = jnp.max(error, axis=(0, 1)) / jnp.max(jnp.abs(b), axis=(0, 1))
+    size = jnp.max(jnp.abs(b), axis=(0, 1))
+    residual = jnp.max(error, axis=(0, 1)) / jnp.where(size > 0, size, 1)
     return (eta, condition, residual), (v, start, solve, a, s)
 
 

@@ -1,0 +1,76 @@
+"""A surface at other points: its normals there, and what has gone wrong with it."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from .build import residual_tolerance
+from .frames import frames_of
+
+# What a code says of a point.
+CODES = {
+    1: "its position or normal is not finite",
+    2: "the normal of a neighbour next to it points to the other side",
+    3: "its stencil is degenerate",
+}
+
+# Each brings normals closer to where a rigid motion takes them, by the error of the gradient.
+_TURNS = 4
+
+
+@jax.jit
+def carried(gradient, normals, before, after):
+    """Normals carried along by a motion of the points, and the factor it stretches areas by.
+
+    The gradient of the positions takes a tangent to itself but for its error, $F_0 t = A t + s n$.
+    So does that of the new positions, with the images in place of t and n; which A and s then tell.
+    """
+    tangents = frames_of(normals)[:, :-1]
+    images = [
+        jnp.einsum("nxs,nts->ntx", gradient(x - jnp.mean(x, axis=0)), tangents)
+        for x in (before, after)
+    ]
+    a = jnp.einsum("ntx,nux->ntu", images[0], tangents)
+    s = jnp.einsum("ntx,nx->nt", images[0], normals)
+    ahead = jnp.zeros_like(normals)
+    for _ in range(_TURNS):
+        normal = _crossed(_solved(a, images[1] - s[:, :, None] * ahead[:, None]))
+        length = jnp.sqrt(jnp.sum(normal**2, axis=1))
+        normal = normal / jnp.where(length > 0, length, 1)[:, None]
+        ahead = normal * (length ** (1 / (normals.shape[1] - 1)))[:, None]
+    return normal, length
+
+
+def _solved(a, b):
+    """Solutions of the 1 x 1 or 2 x 2 systems of all points."""
+    if a.shape[1] == 1:
+        return b / a
+    (p, q), (r, s) = jnp.moveaxis(a, 0, -1)
+    inverse = jnp.stack([jnp.stack([s, -q]), jnp.stack([-r, p])]) / (p * s - q * r)
+    return jnp.einsum("tun,nux->ntx", inverse, b)
+
+
+def _crossed(tangents):
+    """The normal of a plane or line of tangents, as long as they are large."""
+    if tangents.shape[1] == 1:
+        return jnp.stack([-tangents[:, 0, 1], tangents[:, 0, 0]], axis=1)
+    return jnp.cross(tangents[:, 0], tangents[:, 1])
+
+
+@jax.jit
+def judged(cloud, neighbors, residual):
+    points, normals = cloud.points, cloud.normals
+    ill = ~jnp.all(jnp.isfinite(points) & jnp.isfinite(normals), axis=1)
+
+    def turned(found, slot):
+        index, used = slot
+        return found | (used & (jnp.sum(normals[index] * normals, axis=1) < 0)), None
+
+    # Of those farther away, other lists would leave out what has turned.
+    ring = 2 * points.shape[1] + 1
+    lists = (neighbors.indices[:, 1:ring].T, neighbors.mask[:, 1:ring].T)
+    folded = jax.lax.scan(turned, jnp.zeros(len(points), bool), lists)[0]
+    poor = ~(residual < residual_tolerance(residual.dtype))
+    code = jnp.where(ill, 1, jnp.where(folded, 2, jnp.where(poor, 3, 0)))
+    return jnp.where(neighbors.mask[:, 0], code, 0)

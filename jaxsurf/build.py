@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from .arguments import instance, is_concrete
 from .arguments import mask as checked_mask
 from .cloud import PointCloud
-from .compiling import sized_jit
+from .compiling import copying_jit, sized_jit
 from .neighbors import Neighbors, Rows, find_neighbors, nearest_of
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood
@@ -95,7 +95,7 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     border = cloud.boundary
     if border is not None and cloud.active is not None:
         border = border & cloud.active
-    stencil = Stencil(neighbors.indices.T, values, components, (), diagnostics, border)
+    stencil = Stencil(_turned(neighbors.indices), values, components, (), diagnostics, border)
     if throw and is_concrete(values):
         _check(stencil, neighbors, method, target, cloud.dim)
     return stencil
@@ -109,24 +109,36 @@ def stencil_weights(
     Three programs. The one in the middle takes long to compile and knows nothing of the number of
     points but a rounded number of blocks, so that clouds of other sizes share it.
     """
-    rows = jnp.arange(cloud.n) if rows is None else rows
+    rows = np.arange(cloud.n, dtype=np.int32) if rows is None else rows
     blocks = blocks_of(cloud, neighbors, rows, method.batch_size)
     return rows_of(*_weights_of_blocks(blocks, method, target), len(rows))
 
 
-@sized_jit
+@copying_jit
 def blocks_of(cloud, neighbors, rows, size: int):
     """Positions and normals of the neighbours of some rows, mask and radius, in blocks."""
     slots = in_blocks(neighbors.indices.T, size)
     # One coordinate at a time: one gather for all of them is slower.
     points, normals = (
-        [column.at[slots].get(mode="promise_in_bounds") for column in vectors.T]
-        for vectors in (cloud.points, cloud.normals)
+        [_taken(column, slots) for column in vectors.T] for vectors in (cloud.points, cloud.normals)
     )
     radius = neighbors.radius
-    if radius is not None:
-        radius = jnp.broadcast_to(radius, (cloud.n,))[in_blocks(rows, size)]
+    if radius is not None and radius.ndim:
+        radius = radius[in_blocks(rows, size)]
+    elif radius is not None:
+        radius = radius + 0 * points[0][:, 0]
     return points, normals, in_blocks(neighbors.mask.T, size), radius
+
+
+@copying_jit
+def _turned(indices):
+    return indices.T
+
+
+def _taken(column, slots):
+    if isinstance(column, np.ndarray):
+        return column[slots]
+    return column.at[slots].get(mode="promise_in_bounds")
 
 
 @sized_jit
@@ -142,11 +154,11 @@ def neighborhood(block) -> Neighborhood:
     return Neighborhood(offsets, jnp.stack(normals, axis=1), mask, radius)
 
 
-@sized_jit
+@copying_jit
 def rows_of(weights, others, count: int):
     """Weights, with the slots first, and what else was found of the rows, out of their blocks."""
     weights, others = jax.tree.map(lambda a: out_of_blocks(a, count), (weights, others))
-    return jnp.moveaxis(weights, -2, 0), others
+    return weights.transpose(-2 % weights.ndim, *range(weights.ndim - 2), -1 % weights.ndim), others
 
 
 # --- neighbourhoods ------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from .arguments import is_concrete
 # Down to half the time to compile, and up to twice that to run (`is_quick`: simpler forms).
 _QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 # Numbers given to a program, in all its arrays, below which it is small.
-_SMALL = 2_000_000
+_SMALL = 1_750_000
 _quickly = contextvars.ContextVar("quickly", default=False)
 
 
@@ -48,11 +48,9 @@ def sized_jit(f: Callable) -> Callable:
     @functools.wraps(f)
     def call(*args):
         leaves, structure = jax.tree.flatten(args)
-        is_array = [isinstance(a, jax.Array | np.ndarray) for a in leaves]
-        arrays = [a if array else None for a, array in zip(leaves, is_array)]
-        others = tuple(None if array else a for a, array in zip(leaves, is_array))
-        small = sum(a.size for a in arrays if a is not None) < _SMALL
-        if small and is_concrete(*leaves) and _is_known():
+        arrays = [a if _is_array(a) else None for a in leaves]
+        others = tuple(None if _is_array(a) else a for a in leaves)
+        if _takes_longer_to_compile(leaves):
             try:
                 return quick(arrays, others, structure)
             except ValueError:  # within another program, if only with constants
@@ -60,6 +58,33 @@ def sized_jit(f: Callable) -> Callable:
         return thorough(arrays, others, structure)
 
     return call
+
+
+def copying_jit(f: Callable) -> Callable:
+    """`sized_jit` for a function that copies only: small arrays are left to NumPy, uncompiled.
+
+    It is written in what both kinds of arrays have. (What it returns is on the device.)
+    """
+    compiled = sized_jit(f)
+
+    @functools.wraps(f)
+    def call(*args):
+        if _takes_longer_to_compile(jax.tree.leaves(args)):
+            found = f(*jax.tree.map(lambda a: np.asarray(a) if _is_array(a) else a, args))
+            return jax.tree.map(jax.device_put, found)
+        return compiled(*args)
+
+    return call
+
+
+def _is_array(a) -> bool:
+    return isinstance(a, jax.Array | np.ndarray)
+
+
+def _takes_longer_to_compile(leaves: list) -> bool:
+    """Whether a program of these arguments is taken to be compiled for longer than it runs."""
+    small = sum(a.size for a in leaves if _is_array(a)) < _SMALL
+    return small and is_concrete(*leaves) and _is_known()
 
 
 @functools.cache

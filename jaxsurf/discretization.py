@@ -15,6 +15,7 @@ from .arguments import as_float, finite, instance, is_concrete, raise_at, refuse
 from .borders import Border, find_border
 from .build import build, choose_neighbors, residual_tolerance
 from .cloud import PointCloud
+from .compiling import copying_jit
 from .interpolation import interpolation_weights, nearest_points
 from .motion import CODES, carried, judged
 from .neighbors import Neighbors
@@ -412,7 +413,7 @@ def _length(vectors):
     return jnp.sqrt(jnp.sum(vectors**2, axis=-1))
 
 
-@jax.jit
+@copying_jit
 def _first_and_others(weights):
     return weights[:, 0], weights[:, 1:]
 

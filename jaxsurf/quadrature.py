@@ -53,7 +53,7 @@ def cell_weights(
         Weights `(k, n)`; whether each cell is bounded by neighbours so near that no other
         point can have a part of it; the relative moment residual of its weights.
     """
-    blocks = blocks_of(cloud, neighbors, jnp.arange(cloud.n), _BATCH)
+    blocks = blocks_of(cloud, neighbors, np.arange(cloud.n, dtype=np.int32), _BATCH)
     lines = None if outward is None else in_blocks(outward.T, _BATCH)
     mask, cells = blocks[2], min(cells, neighbors.k)
     # Programs of their own: in one, the compiler finds much again for every use of it, and a

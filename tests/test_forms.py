@@ -257,14 +257,13 @@ def test_another_geometry_compiles_nothing():
 
 
 def test_another_number_of_points_shares_the_long_program():
-    """Only what gathers for it, and sorts its results, is compiled."""
+    """What gathers for it, and sorts its results, is done by NumPy."""
     clouds = [jittered_sphere(n) for n in (N - 17, N - 18)]
     lists = [js.find_neighbors(cloud, k=24) for cloud in clouds]
     js.laplace_beltrami(clouds[0], lists[0], method=METHOD)
     with count_compilations() as names:
         js.laplace_beltrami(clouds[1], lists[1], method=METHOD)
-    assert {"jit(blocks_of)", "jit(rows_of)"} <= set(names), names
-    assert len(names) < 8 and "jit(_weights_of_blocks)" not in names, names
+    assert len(names) < 8 and not {"jit(_weights_of_blocks)", "jit(blocks_of)"} & set(names), names
 
 
 def test_small_programs_are_the_same_in_every_form():

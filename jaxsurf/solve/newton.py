@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from ..arguments import as_float, is_concrete, whole
 from ..boundary import Closure
+from ..compiling import sized_jit
 from ..functions import canonical, numbers_as_arrays
 from ..stencils.stencil import AbstractOperator, Stencil
 from .krylov import BiCGStab, tolerances_as_arrays
@@ -126,8 +127,7 @@ def solve_nonlinear(
     concrete = is_concrete(*jax.tree.leaves((problem, u0, preconditioner)))
     numbers = np.asarray(rtol), np.asarray(float(atol)), np.asarray(max_steps)
     solver = None if solver is None else tolerances_as_arrays(solver)
-    limits = (*numbers, throw and not concrete)
-    solution = _solve(problem, u0, layout, preconditioner, solver, *limits)
+    solution = _solve(problem, u0, layout, preconditioner, solver, *numbers, concrete, throw)
     if throw and concrete and bool(solution.result != optx.RESULTS.successful):
         raise RuntimeError(
             f"not solved: relative residual {float(solution.stats['relative_residual']):.1e} after "
@@ -178,12 +178,10 @@ class _State(eqx.Module):
     falls: Array
 
 
-@eqx.filter_jit
-def _solve(problem, u0, layout, preconditioner, solver, rtol, atol, max_steps, throw):
+@sized_jit
+def _solve(problem, u0, layout, preconditioner, solver, rtol, atol, max_steps, concrete, throw):
     fixed = _constant(problem)
     loose = BiCGStab(_FORCING, 0.0, 1000) if solver is None else solver
-    finest = tolerance(None, u0.dtype)
-    tight = BiCGStab(jnp.minimum(rtol, finest), 0.0, 1000) if solver is None else solver
     start = fixed.residual(jax.lax.stop_gradient(u0))
     size = jnp.linalg.norm(start)
     source = jnp.linalg.norm(jnp.broadcast_to(fixed.rhs, u0.shape))
@@ -225,11 +223,15 @@ def _solve(problem, u0, layout, preconditioner, solver, rtol, atol, max_steps, t
         optx.RESULTS.nonlinear_divergence,
     )
     result = optx.RESULTS.where(state.size <= target, optx.RESULTS.successful, result)
-    # One more Newton step has the derivative of the solution; its value is below the tolerance.
-    left = problem.residual(state.v)
-    last = problem.correction(state.v, left, layout, preconditioner, tight).value
-    u = problem.field(state.v + last - jax.lax.stop_gradient(last))
-    if throw:
+    v = state.v
+    if not concrete:
+        # One more Newton step has the derivative of the solution; its value is below the tolerance.
+        finest = tolerance(None, u0.dtype)
+        tight = BiCGStab(jnp.minimum(rtol, finest), 0.0, 1000) if solver is None else solver
+        last = problem.correction(v, problem.residual(v), layout, preconditioner, tight).value
+        v = v + last - jax.lax.stop_gradient(last)
+    u = problem.field(v)
+    if throw and not concrete:
         u = eqx.error_if(
             u,
             result != optx.RESULTS.successful,

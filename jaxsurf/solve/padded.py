@@ -25,7 +25,7 @@ from ..stencils.stencil import AbstractOperator, Composition, Stencil
 _SCATTER = 12
 # Room in the list of entries beyond the slots: this share of the rows, or 4, 16, ... times that.
 _LISTED = 1 / 8
-# Widths tried for a matrix of known usual width: that times powers of this.
+# Widths tried for a matrix of known usual width: that times powers of this, if not told otherwise.
 _STEP = 0.7
 # Below this many entries everything is gathered at once, without a loop over slots.
 _SMALL = 50_000
@@ -55,6 +55,7 @@ def tabulate(
     *,
     rows: int | None = None,
     width: float | None = None,
+    step: float = _STEP,
 ) -> Table:
     """Slots for the rows of a matrix in compressed form.
 
@@ -63,10 +64,11 @@ def tabulate(
         source: numbers to put in place of those of the entries.
         rows: number of rows, empty ones at the end counted; those of the matrix if None.
         width: about the length of the longest rows, if known.
+        step: widths tried are that times powers of this.
     """
     start, length = indptr[:-1].astype(np.int32), np.diff(indptr).astype(np.int32)
     count, m = len(columns), max(len(length), rows or 0)
-    k, listed = _slots(length, m, width)
+    k, listed = _slots(length, m, width, step)
     table, numbers = np.zeros((k, m), np.int32), np.full((k, m), count, np.int32)
     # By the transposes: a row at a time, entries where they stand in memory.
     filled = np.arange(k, dtype=np.int32) < length[:, None]
@@ -80,8 +82,8 @@ def tabulate(
     long = np.flatnonzero(length > k)
     over = length[long] - k
     owner = np.repeat(long, over)
-    step = np.arange(len(owner)) - np.repeat(np.cumsum(over) - over, over)
-    beyond = start[owner] + k + step
+    rank = np.arange(len(owner)) - np.repeat(np.cumsum(over) - over, over)
+    beyond = start[owner] + k + rank
     padded = lambda a, fill: np.append(a, np.full(listed - len(a), fill)).astype(np.int32)
     others, sources = padded(columns[beyond], 0), padded(beyond, count)
     if source is not None:
@@ -90,14 +92,14 @@ def tabulate(
     return Table(table, numbers, padded(owner, 0), others, sources)
 
 
-def _slots(length: np.ndarray, m: int, width: float | None) -> tuple[int, int]:
+def _slots(length: np.ndarray, m: int, width: float | None, step: float) -> tuple[int, int]:
     """Number of slots and room in the list, of the few that there are, by the cost of applying."""
     widest = int(length.max(initial=0))
     # Number of entries beyond the k-th of their row, for every k.
     longer = len(length) - np.cumsum(np.bincount(length, minlength=widest + 1))
     overflow = np.append(np.cumsum(longer[::-1])[::-1], 0)
     best = math.inf, 0, 0
-    for k in _widths(width):
+    for k in _widths(width, step):
         over = int(overflow[min(k, widest + 1)])
         listed = max(math.ceil(m * _LISTED), 1)
         while listed < over:
@@ -108,7 +110,7 @@ def _slots(length: np.ndarray, m: int, width: float | None) -> tuple[int, int]:
     raise AssertionError("the widths have no end")
 
 
-def _widths(width: float | None) -> Iterator[int]:
+def _widths(width: float | None, step: float) -> Iterator[int]:
     """Numbers of slots: powers of two times 5/4 and 7/4, or those around a usual width."""
     if width is None:
         yield 1
@@ -116,8 +118,8 @@ def _widths(width: float | None) -> Iterator[int]:
             yield 2**power * 5 // 4
             yield 2**power * 7 // 4
     else:
-        for power in itertools.count(-math.ceil(math.log(max(width, 1)) / -math.log(_STEP))):
-            yield math.ceil(width * _STEP**-power)
+        for power in itertools.count(-math.ceil(math.log(max(width, 1)) / -math.log(step))):
+            yield math.ceil(width * step**-power)
 
 
 class PaddedMatrix(eqx.Module):
@@ -137,10 +139,10 @@ class PaddedMatrix(eqx.Module):
 
     @classmethod
     def from_scipy(
-        cls, matrix: scipy.sparse.csr_matrix, dtype, *, rows=None, width=None
+        cls, matrix: scipy.sparse.csr_matrix, dtype, *, rows=None, width=None, step=_STEP
     ) -> PaddedMatrix:
         """Its rows in slots; `rows` and `width` as for `tabulate`."""
-        table = tabulate(matrix.indptr, matrix.indices, rows=rows, width=width)
+        table = tabulate(matrix.indptr, matrix.indices, rows=rows, width=width, step=step)
         values = np.append(matrix.data.astype(dtype), np.zeros(1, dtype))
         extra = (table.rows, table.others, values[table.sources])
         return cls(*jax.device_put((table.columns, values[table.source], None, extra)))

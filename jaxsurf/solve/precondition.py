@@ -369,7 +369,8 @@ def transfers(padded, restrict, prolong, coarse: int) -> tuple[PaddedMatrix, Pad
     (k, rows), dtype = padded.indices.shape, padded.weights.dtype
     return (
         PaddedMatrix.from_scipy(restrict, dtype, rows=coarse, width=2.2 * k + 12),
-        PaddedMatrix.from_scipy(prolong, dtype, rows=rows, width=0.16 * k + 2),
+        # Few slots: rather some too many than another number on the next surface.
+        PaddedMatrix.from_scipy(prolong, dtype, rows=rows, width=0.16 * k + 2, step=0.5),
     )
 
 

@@ -63,6 +63,7 @@ from .shapes.meshes import sample_mesh as sample_mesh
 from .shapes.order import sort_cloud as sort_cloud
 from .shapes.sampling import jitter as jitter
 from .shapes.sampling import poisson_disk as poisson_disk
+from .solve.conserve import conservative_weights as conservative_weights
 from .solve.eigen import Eigenmodes as Eigenmodes
 from .solve.eigen import eigenmodes as eigenmodes
 from .solve.geodesic import geodesic_distance as geodesic_distance

@@ -99,7 +99,25 @@ def limits(function, call):
     ]
 
 
+def conserved(operator=None, total=1.0, **options):
+    return js.conservative_weights(laplacian() if operator is None else operator, total, **options)
+
+
 CASES = [
+    *operators("conservative_weights", conserved),
+    Case("conservative_weights", "no area", lambda: conserved(total=0.0), ("total", "0")),
+    Case("conservative_weights", "an area that is no number", lambda: conserved(total=np.nan),
+         ("total", "nan")),
+    Case("conservative_weights", "areas in place of their sum", lambda: conserved(total=z()),
+         ("total", "60")),
+    Case("conservative_weights", "a composition", lambda: conserved(laplacian() @ laplacian()),
+         ("operator", "outer")),
+    Case("conservative_weights", "a function as preconditioner",
+         lambda: conserved(preconditioner=jnp.sin), ("preconditioner", "js.multigrid")),
+    Case("conservative_weights", "heat that is lost", lambda: conserved(laplacian().shifted(-1.0)),
+         ("operator", "constants")),
+    Case("conservative_weights", "a border about which nothing is said",
+         lambda: conserved(marked()), ("border",)),
     *operators("solve", solve),
     *operators("solve_nonlinear", newton),
     *operators("eigenmodes", modes),

@@ -23,6 +23,16 @@ TESTED = {
         "float32": "test_steady.py::test_single_precision",
         "bad input": "malformed",
     },
+    "conservative_weights": {
+        "value": "test_conserve.py::test_nothing_is_left_and_weights_are_positive, "
+        "test_conserve.py::test_they_are_a_quadrature_of_the_order_of_the_operator, "
+        "test_conserve.py::test_mass_is_conserved_to_round_off",
+        "gradient": {"weights, total, points": "test_conserve.py::test_derivatives"},
+        "jit": "test_conserve.py::test_under_jit_and_vmap",
+        "vmap": "test_conserve.py::test_under_jit_and_vmap",
+        "float32": "test_conserve.py::test_single_precision",
+        "bad input": "malformed",
+    },
     "solve_nonlinear": {
         "value": "test_newton.py::test_known_solution_in_few_steps",
         "gradient": {

@@ -1,0 +1,114 @@
+"""Weights of points with which a diffusing system on a closed surface conserves its mass."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, ArrayLike, Float
+
+from ..arguments import instance, is_concrete, real
+from ..compiling import sized_jit
+from ..stencils.stencil import Stencil
+from .krylov import BiCGStab
+from .precondition import AbstractPreconditioner, hierarchy
+from .system import Inverse, System, check_system
+
+# Relative tolerance of two solves, of which the second takes away what the first one leaves, in
+# units of round-off.
+_SOLVED = 1e4
+# Largest sum of weights times a column of the operator that counts as round-off, in units of it and
+# of the sum of moduli.
+_LEFT = 1e3
+
+
+def conservative_weights(
+    operator: Stencil,
+    total: ArrayLike,
+    *,
+    preconditioner: AbstractPreconditioner | None = None,
+) -> Float[Array, " n"]:
+    r"""Weights m with $m^T L = 0$: $\sum_i m_i u_i$ is what $\partial_t u = L u$ conserves.
+
+    The areas of the points fit $\sum_i a_i (L u)_i = 0$ to the order of the operator only, so that
+    the mass $\sum_i a_i u_i$ drifts. On a connected closed surface there is, but for a factor, one
+    vector of weights with which it does not. It is a quadrature of the surface as well.
+
+    Args:
+        operator: L, scalar, of a connected closed surface: it annihilates the constants.
+        total: what the weights add up to: the area of the surface, `surface.areas.sum()`.
+        preconditioner: from `multigrid(operator)`; made here if None, on concrete operators.
+
+    Returns:
+        Weights `(n,)`, in the units of `total`; as `mass=` of a problem in time they make its
+        correction vanish. Positive where the points allow it, as the areas are; not made so.
+
+    Accuracy: $m^T L$ to round-off; as a quadrature $O(h^r)$ with operators of order r
+    (`tests/test_conserve.py`).
+    Differentiable: forward and reverse, in the weights of the operator and in `total`.
+    Raises:
+        TypeError: no operator or preconditioner.
+        ValueError: an operator with components, one that does not annihilate the constants; a
+            traced one without a preconditioner.
+        RuntimeError: no such weights have been found.
+
+    Example:
+        >>> surface = js.discretize(js.sphere(1_000))
+        >>> m = js.conservative_weights(surface.laplacian, surface.areas.sum())
+        >>> u = surface.cloud.points[:, 0] ** 3
+        >>> bool(abs(m @ surface.laplacian(u)) < 1e-10)
+        True
+    """
+    hint = "js.laplace_beltrami(cloud) makes one; of compositions pass the outer operator"
+    instance(operator, Stencil, "operator", hint)
+    check_system(operator, None, preconditioner, None, 0.0)
+    real(total, "total", above=0)
+    concrete = is_concrete(total, *jax.tree.leaves((operator, preconditioner)))
+    if preconditioner is None:
+        if not is_concrete(*jax.tree.leaves(operator)):
+            raise ValueError(
+                "operator is traced: pass a preconditioner made outside by js.multigrid(operator)"
+            )
+        preconditioner = hierarchy(operator, None)
+    if preconditioner.mean_zero is False:
+        raise ValueError(
+            "operator does not annihilate the constants: no weights are conserved, as where heat "
+            "passes through a border or is lost"
+        )
+    total = jnp.asarray(total, jnp.result_type(float, *jax.tree.leaves(operator)))
+    weights, left = _weights(operator, total, preconditioner)
+    allowed = _LEFT * float(jnp.finfo(weights.dtype).eps)
+    text = (
+        "weights that conserve the mass have been found to {} of round-off only, {:.0e} is needed: "
+        "the surface may fall into parts, or the operator have growing modes"
+    )
+    if concrete:
+        if not float(left) <= allowed:
+            raise RuntimeError(text.format(f"{float(left):.1e}", allowed))
+        return weights
+    return eqx.error_if(weights, ~(left <= allowed), text.format("more", allowed))
+
+
+@sized_jit
+def _weights(operator, total, preconditioner):
+    """The weights, and what is left of their products with the columns, of the sums of moduli."""
+    # S = L - σ p pᵀ / n, p = 1, is not singular, and Sᵀ m = -σ total / n where Lᵀ m = 0.
+    dtype = total.dtype
+    system = System.of(operator, None, preconditioner.incoming, dtype, True)
+    adjoint, fixed = system.transpose(), jax.lax.stop_gradient(system.transpose())
+    inverse = jax.lax.stop_gradient(Inverse(preconditioner, system)).transpose()
+    options = {"preconditioner": inverse}
+    solver = BiCGStab(_SOLVED * float(jnp.finfo(dtype).eps))
+    sigma = jnp.asarray(system.sigma)
+    rhs = system.constant(-sigma * total / operator.n)
+
+    def solved(matrix, b):
+        return lx.linear_solve(matrix, b, solver, options=options, throw=False).value
+
+    first = solved(fixed, jax.lax.stop_gradient(rhs))
+    # Has the derivative of the solution.
+    weights = first + solved(adjoint, rhs - adjoint.mv(first))
+    products = jax.lax.stop_gradient(adjoint.mv(weights) - rhs)
+    size = jax.lax.stop_gradient(jnp.max(jnp.abs(operator.diagonal * weights)))
+    return weights, jnp.max(jnp.abs(products)) / size

@@ -11,7 +11,7 @@ import numpy as np
 
 from .arguments import is_concrete
 
-# Down to half the time to compile, and up to twice that to run (`is_quick`: simpler forms).
+# Quicker to compile, slower to run; `is_quick` asks for simpler forms beside.
 _QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 # Numbers given to a program, in all its arrays, below which it is small.
 _SMALL = 1_750_000

@@ -31,7 +31,7 @@ _CELLS = 24
 
 
 class _Kept:
-    """A property that is computed once; anew where anything is traced."""
+    """A property that is computed once; anew where the surface itself is traced."""
 
     def __init__(self, make: Callable):
         self.make = make
@@ -49,17 +49,19 @@ class _Kept:
             object.__setattr__(surface, "_kept", kept)
         if self.name in kept:
             return kept[self.name]
-        value = self.make(surface)
-        if is_concrete(*jax.tree.leaves((surface, value))):
-            kept[self.name] = value
-        return value
+        if not is_concrete(*jax.tree.leaves(surface)):
+            return self.make(surface)
+        # Also where other things are traced: this is a constant of theirs.
+        with jax.ensure_compile_time_eval():
+            kept[self.name] = self.make(surface)
+        return kept[self.name]
 
 
 class Discretization(eqx.Module):
     r"""A cloud with neighbours and a method: the surface, as far as it can be calculated with.
 
-    Made by `discretize`. Operators, curvatures and areas are computed when they are first asked
-    for, and kept; under `jit`, `vmap` and `grad` every time.
+    Made by `discretize`. Operators and areas are computed when they are first asked for, and kept;
+    where points or normals are traced every time.
 
     Args:
         cloud: n points in d dimensions with unit normals.

@@ -308,10 +308,11 @@ def test_operators_are_made_once():
         np.testing.assert_allclose(surface.laplacian.weights, anew.weights, atol=1e-11 * scale)
         gradient = js.surface_gradient(cloud, lists, method=method)
         np.testing.assert_allclose(surface.gradient.weights, gradient.weights, atol=1e-11 * scale)
-        # Nothing of a trace is kept.
-        jax.jit(lambda u, s=js.discretize(cloud, lists, method=method): s.laplacian(u))(
-            jnp.ones(300)
-        )
+        # What is first asked for in a trace is kept as a constant, nothing of the trace.
+        other = js.discretize(cloud, lists, method=method)
+        jax.jit(lambda u, other=other: other.gradient(u))(jnp.ones(300))
+        assert not isinstance(other.gradient.weights, jax.core.Tracer)
+        assert other.gradient is other.gradient
         np.testing.assert_allclose(
             surface.mean_curvature, js.mean_curvature(cloud, lists, method=method), rtol=1e-9
         )

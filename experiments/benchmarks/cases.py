@@ -193,6 +193,40 @@ def gradient(name: str, n: int, reverse: bool) -> dict:
             "GiB before": before, "temporary MiB": memory.temp_size_in_bytes / 2**20}  # fmt: skip
 
 
+def moved(name: str, n: int) -> dict:
+    """A moved surface in units of building its Laplacian: all of it, areas alone, and gradients.
+
+    Gradients in the points, of areas outside `jit`, where they are several programs, and in it.
+    """
+    method, _ = METHODS[name]
+    surface = js.discretize(js.sphere(n), method=method)
+    x = 1.01 * surface.cloud.points
+    fresh = lambda x: js.Discretization(
+        js.PointCloud(x, surface.cloud.normals), surface.neighbors, method
+    )
+    volume = lambda x: jnp.vdot(fresh(x).areas, jnp.sin(x[:, 2]))
+
+    def everything(x):
+        there = surface.moved(x)
+        return there.laplacian.weights, there.areas, there.code
+
+    calls = {
+        "Laplacian": jax.jit(lambda x: fresh(x).laplacian.weights),
+        "areas": lambda x: fresh(x).areas,
+        "areas in jit": jax.jit(lambda x: fresh(x).areas),
+        "gradient of areas": jax.grad(volume),
+        "gradient of areas in jit": jax.jit(jax.grad(volume)),
+        "moved": jax.jit(everything),
+    }
+    found: dict = {}
+    for label, call in calls.items():
+        first, seconds = first_and_median(lambda call=call: call(x), 5)
+        found |= {f"{label} s": seconds, f"{label}, first s": first}
+        if label != "Laplacian":
+            found[f"{label} / Laplacian"] = seconds / found["Laplacian s"]
+    return found
+
+
 def retraces() -> dict:
     """How often two calls of the same shape trace the operator."""
     cloud, neighbors = _sphere(2000, 26)

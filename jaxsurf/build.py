@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from .arguments import instance, is_concrete
 from .arguments import mask as checked_mask
 from .cloud import PointCloud
-from .compiling import copying_jit, sized_jit
+from .compiling import copying_jit, namespace, sized_jit
 from .neighbors import Neighbors, Rows, find_neighbors, nearest_of
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood
@@ -123,10 +123,8 @@ def blocks_of(cloud, neighbors, rows, size: int):
         [_taken(column, slots) for column in vectors.T] for vectors in (cloud.points, cloud.normals)
     )
     radius = neighbors.radius
-    if radius is not None and radius.ndim:
-        radius = radius[in_blocks(rows, size)]
-    elif radius is not None:
-        radius = radius + 0 * points[0][:, 0]
+    if radius is not None:
+        radius = namespace(radius).broadcast_to(radius, (cloud.n,))[in_blocks(rows, size)]
     return points, normals, in_blocks(neighbors.mask.T, size), radius
 
 
@@ -136,7 +134,7 @@ def _turned(indices):
 
 
 def _taken(column, slots):
-    if isinstance(column, np.ndarray):
+    if namespace(column) is np:
         return column[slots]
     return column.at[slots].get(mode="promise_in_bounds")
 
@@ -158,7 +156,7 @@ def neighborhood(block) -> Neighborhood:
 def rows_of(weights, others, count: int):
     """Weights, with the slots first, and what else was found of the rows, out of their blocks."""
     weights, others = jax.tree.map(lambda a: out_of_blocks(a, count), (weights, others))
-    return weights.transpose(-2 % weights.ndim, *range(weights.ndim - 2), -1 % weights.ndim), others
+    return namespace(weights).moveaxis(weights, -2, 0), others
 
 
 # --- neighbourhoods ------------------------------------------------------------------------

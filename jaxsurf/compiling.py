@@ -7,6 +7,7 @@ import functools
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .arguments import is_concrete
@@ -63,7 +64,7 @@ def sized_jit(f: Callable) -> Callable:
 def copying_jit(f: Callable) -> Callable:
     """`sized_jit` for a function that copies only: small arrays are left to NumPy, uncompiled.
 
-    It is written in what both kinds of arrays have. (What it returns is on the device.)
+    It is written for both kinds of arrays, see `namespace`. (What it returns is on the device.)
     """
     compiled = sized_jit(f)
 
@@ -75,6 +76,11 @@ def copying_jit(f: Callable) -> Callable:
         return compiled(*args)
 
     return call
+
+
+def namespace(a):
+    """NumPy for its arrays, else `jax.numpy`."""
+    return np if isinstance(a, np.ndarray) else jnp
 
 
 def _is_array(a) -> bool:

@@ -127,7 +127,9 @@ def solve_nonlinear(
     concrete = is_concrete(*jax.tree.leaves((problem, u0, preconditioner)))
     numbers = np.asarray(rtol), np.asarray(float(atol)), np.asarray(max_steps)
     solver = None if solver is None else tolerances_as_arrays(solver)
-    solution = _solve(problem, u0, layout, preconditioner, solver, *numbers, concrete, throw)
+    # Errors of concrete problems are raised here: they share one program, whatever `throw` is.
+    flags = concrete, throw and not concrete
+    solution = _solve(problem, u0, layout, preconditioner, solver, *numbers, *flags)
     if throw and concrete and bool(solution.result != optx.RESULTS.successful):
         raise RuntimeError(
             f"not solved: relative residual {float(solution.stats['relative_residual']):.1e} after "
@@ -231,7 +233,7 @@ def _solve(problem, u0, layout, preconditioner, solver, rtol, atol, max_steps, c
         last = problem.correction(v, problem.residual(v), layout, preconditioner, tight).value
         v = v + last - jax.lax.stop_gradient(last)
     u = problem.field(v)
-    if throw and not concrete:
+    if throw:
         u = eqx.error_if(
             u,
             result != optx.RESULTS.successful,

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
+from ..compiling import namespace
 from . import systems
 from .monomials import differentiation, monomial_rows, monomials, multi_indices, position
 
@@ -186,19 +187,19 @@ def in_blocks(a: Shaped[Array, "*s n"], size: int) -> Shaped[Array, "blocks *s s
     blocks = -(-a.shape[-1] // size)
     unit = 1 << max(blocks.bit_length() - (3 if blocks <= 64 else 5), 0)
     missing = -(-blocks // unit) * unit * size - a.shape[-1]
-    xp = np if isinstance(a, np.ndarray) else jnp
+    xp = namespace(a)
     a = xp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, missing)], mode="edge")
     return xp.moveaxis(a.reshape(*a.shape[:-1], -1, size), -2, 0)
 
 
 def out_of_blocks(a: Shaped[Array, "blocks *s size"], n: int) -> Shaped[Array, "*s n"]:
     """The inverse: blocks side by side along the last axis, without what filled them up."""
-    if isinstance(a, np.ndarray):
-        a = np.moveaxis(a, 0, -2)
-        return a.reshape(*a.shape[:-2], -1)[..., :n]
-    a = jnp.moveaxis(a, 0, -2)
-    # Apart from the copy above, which is slow where the compiler makes one of both.
-    a = jax.lax.optimization_barrier(a.reshape(*a.shape[:-2], -1))
+    xp = namespace(a)
+    a = xp.moveaxis(a, 0, -2)
+    a = a.reshape(*a.shape[:-2], -1)
+    if xp is jnp:
+        # Apart from the copy above, which is slow where the compiler makes one of both.
+        a = jax.lax.optimization_barrier(a)
     return a[..., :n]
 
 

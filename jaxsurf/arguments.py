@@ -23,6 +23,31 @@ def is_concrete(*arrays: Any) -> bool:
     return not any(isinstance(a, jax.core.Tracer) for a in arrays)
 
 
+def without_derivatives(tree: Any) -> Any:
+    """The values that are being differentiated, where they are known: what choices are made by.
+
+    Under `grad`, `jvp` and the like these are concrete arrays; of `jit` and `vmap` the tracers stay.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    return jax.tree.unflatten(structure, [_beneath(x) for x in leaves])
+
+
+def _beneath(x: Any) -> Any:
+    if is_concrete(x) or not jnp.issubdtype(x.dtype, jnp.inexact):
+        return x
+    seen = []
+
+    @jax.custom_jvp
+    def look(x):
+        seen.append(x)
+        return x
+
+    # A rule is called with what its transformation differentiates: one level after another.
+    look.defjvp(lambda primals, tangents: (look(*primals), *tangents))
+    look(x)
+    return seen[-1]
+
+
 def raise_at(bad: np.ndarray, message: str, values: np.ndarray) -> None:
     """Raise a ValueError that names the first bad index, its value, and how many there are."""
     where = np.flatnonzero(bad)

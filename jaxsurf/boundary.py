@@ -29,9 +29,9 @@ from .build import residual_tolerance, stencil_weights
 from .cloud import PointCloud
 from .conditions import Condition, checked_conditions
 from .neighbors import Neighbors, Rows, nearest_of
+from .stencils.algebra import AbstractOperator
 from .stencils.gfdm import GFDM
 from .stencils.method import AbstractMethod
-from .stencils.stencil import AbstractOperator, Stencil
 from .stencils.targets import Gradient
 
 # The factor of an unknown value has to be more than this share of its terms.
@@ -165,15 +165,19 @@ class Closure(eqx.Module):
             raise ValueError(f"field has shape {u.shape}, expected at most {self.n} points")
         return self(jnp.concatenate([u, jnp.zeros((self.n - len(u), *u.shape[1:]), u.dtype)]), t)
 
+    def reduce(self, operator: AbstractOperator) -> AbstractOperator:
+        """P A E: what an operator A on all points does to the free ones."""
+        return self.restriction @ operator @ self.extension
+
     @property
-    def stencil(self) -> Stencil:
-        """E as an operator on all points. It stores k weights per point, free ones too."""
-        k = self.indices.shape[0]
-        own = jnp.arange(self.n, dtype=self.indices.dtype)
-        indices = jnp.broadcast_to(own, (k + 1, self.n)).at[1:, self.rows].set(self.indices)
-        weights = jnp.zeros((k + 1, self.n), self.weights.dtype).at[0].set(1)
-        weights = weights.at[0, self.rows].set(0).at[1:, self.rows].set(self.weights)
-        return Stencil(indices, weights)
+    def extension(self) -> Extension:
+        """E as an operator."""
+        return Extension(self)
+
+    @property
+    def restriction(self) -> Restriction:
+        """P as an operator."""
+        return Restriction(self)
 
     def to_scipy(self) -> scipy.sparse.csr_matrix:
         """E as a CSR matrix, `(n, n)`."""
@@ -200,6 +204,46 @@ class Closure(eqx.Module):
         return tuple(source.at(t) for source in self.sources)
 
 
+class Extension(AbstractOperator):
+    """E: bound values from the free ones, without what is prescribed."""
+
+    closure: Closure
+    in_shape = ()
+    out_shape = ()
+
+    @property
+    def n(self):
+        return self.closure.n
+
+    def __call__(self, u):
+        return self.closure.homogeneous(u)
+
+    def to_scipy(self):
+        return self.closure.to_scipy()
+
+
+class Restriction(AbstractOperator):
+    """P: bound values set to zero."""
+
+    closure: Closure
+    in_shape = ()
+    out_shape = ()
+
+    @property
+    def n(self):
+        return self.closure.n
+
+    def __call__(self, u):
+        return self.closure.restrict(u)
+
+    def transpose(self):
+        return self
+
+    def to_scipy(self):
+        free = ~np.asarray(self.closure.bound)
+        return scipy.sparse.diags(free.astype(self.closure.weights.dtype)).tocsr()
+
+
 def _components(given) -> tuple[int, ...]:
     """Components per point of prescribed values."""
     sizes = zip_longest(*(g.shape[1:] for *_, g in given), fillvalue=1)
@@ -217,7 +261,7 @@ def _filled(u, rows, indices, weights, given):
         g = g.reshape(*g.shape, *[1] * (len(shape) + 1 - g.ndim))
         part = factor.reshape(-1, *[1] * len(shape)) * g
         values = values.at[slots].add(jnp.broadcast_to(part, (len(slots), *shape)))
-    return u.at[rows].set(values.astype(u.dtype))
+    return u.at[rows].set(values.astype(u.dtype), unique_indices=True)
 
 
 def close(

@@ -381,7 +381,7 @@ def _held_at_border(cloud: PointCloud) -> Closure | None:
 
 def _at_rest_on_border(laplacian: Stencil) -> Stencil:
     border = laplacian.border
-    return laplacian if border is None else laplacian.scaled(1.0 - border)
+    return laplacian if border is None else (1.0 - border) * laplacian
 
 
 def _curvature(cloud, neighbors, method) -> dict[str, Float[Array, " n"]]:

@@ -20,10 +20,11 @@ from .interpolation import interpolation_weights, nearest_points
 from .motion import CODES, carried, judged
 from .neighbors import Neighbors
 from .quadrature import cell_weights
+from .stencils.algebra import Composition
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod
 from .stencils.monomials import polynomial_count
-from .stencils.stencil import Composition, Stencil
+from .stencils.stencil import Stencil
 from .stencils.targets import Gradient, Joint, Laplacian
 
 # So many neighbours may bound a cell; where points are very uneven, all are tried.

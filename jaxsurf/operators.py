@@ -11,9 +11,10 @@ from .arguments import as_float, finite, instance, is_concrete, raise_at, whole
 from .build import build
 from .cloud import PointCloud
 from .neighbors import Neighbors, find_neighbors
+from .stencils.algebra import Composition
 from .stencils.dcpse import DCPSE, FlatDCPSE
 from .stencils.method import AbstractMethod
-from .stencils.stencil import Composition, Stencil
+from .stencils.stencil import Stencil
 from .stencils.targets import Gradient, Hessian, Laplacian, Partial
 
 

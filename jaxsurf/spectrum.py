@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .arguments import instance, is_concrete, whole
-from .stencils.stencil import AbstractOperator, Composition, check_scalar
+from .stencils.algebra import AbstractOperator, Composition, check_scalar
 
 # Operators on fewer points are treated as matrices.
 _DENSE = 150

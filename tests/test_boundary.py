@@ -155,7 +155,7 @@ def test_the_parts_of_a_closure_agree():
     np.testing.assert_allclose(
         closure.to_scipy() @ np.asarray(u), closure.homogeneous(u), atol=1e-14
     )
-    np.testing.assert_allclose(closure.stencil(u), closure.homogeneous(u), atol=1e-14)
+    np.testing.assert_allclose(closure.extension(u), closure.homogeneous(u), atol=1e-14)
     np.testing.assert_allclose(closure(full, t), full, atol=1e-14)  # E² = E
     linear = eqx.filter_jit(lambda c, u: c.homogeneous(u))(closure, u)
     np.testing.assert_allclose(linear, closure.homogeneous(u), atol=1e-14)
@@ -188,7 +188,7 @@ def test_points_that_are_declared_free():
     nothing = js.close(cloud, js.free(border))
     assert nothing.m == 0 and not nothing.bound.any()
     np.testing.assert_array_equal(nothing.declared, border)
-    for filled in (nothing(u), nothing.homogeneous(u), nothing.restrict(u), nothing.stencil(u)):
+    for filled in (nothing(u), nothing.homogeneous(u), nothing.restrict(u), nothing.extension(u)):
         np.testing.assert_array_equal(filled, u)
     np.testing.assert_array_equal(nothing(jnp.stack([u, u], axis=1), 0.3)[:, 1], u)
     np.testing.assert_array_equal(nothing.offset(), 0 * u)
@@ -251,8 +251,8 @@ def test_a_border_about_which_nothing_is_said():
     laplacian = js.laplace_beltrami(cloud, near, method=method)
     operators = [
         laplacian,
-        laplacian.scaled(2.0).shifted(1.0),
-        laplacian.transpose(),
+        2 * laplacian + 1,
+        laplacian.T,
         js.directional_derivative(cloud, jnp.ones((cloud.n, 3)), neighbors=near, method=method),
         js.diffusion(cloud, jnp.ones(cloud.n), neighbors=near, method=method),
         js.surface_divergence(cloud, near, method=method) @ gradient,

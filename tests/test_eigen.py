@@ -57,7 +57,7 @@ def test_a_basis_belongs_to_its_space_alone(sphere_modes):
     cloud, modes = sphere_modes
     operator = laplacian(cloud.n)
     noise = jnp.asarray(np.random.default_rng(0).normal(size=cloud.n))
-    again = js.eigenmodes(operator.scaled(1 + 1e-9 * noise), 18)
+    again = js.eigenmodes((1 + 1e-9 * noise) * operator, 18)
     np.testing.assert_allclose(again.functions[:, :9], modes.functions[:, :9], atol=1e-6)
 
 
@@ -110,7 +110,7 @@ def test_conjugate_pairs():
     np.testing.assert_allclose(modes.imaginary, c * np.sin(m * h) / h, atol=1e-9)
     np.testing.assert_array_equal(modes.groups, m)
     assert modes.residuals.max() < 1e-9
-    scaled = jax.grad(lambda s: jnp.sum(js.eigenmodes(operator(c).scaled(s), 5).values))(1.0)
+    scaled = jax.grad(lambda s: jnp.sum(js.eigenmodes(s * operator(c), 5).values))(1.0)
     assert abs(scaled / modes.values.sum() - 1) < 1e-10
 
 
@@ -149,7 +149,7 @@ def test_derivatives_of_what_belongs_to_a_group():
     field = jnp.exp(cloud.points @ jnp.array([1.0, 2.0, 1.5]))
 
     def observed(noise):
-        modes = js.eigenmodes(operator.scaled(1 + noise), 9, degenerate=0.1)
+        modes = js.eigenmodes((1 + noise) * operator, 9, degenerate=0.1)
         values, functions = modes.values, modes.functions[:, 1:4]
         symmetric = values[1:4].sum() + jnp.prod(values[4:9]) ** 0.2 + jnp.sum(values[4:9] ** 2)
         return jnp.stack([symmetric, jnp.sum((functions.T @ field / cloud.n) ** 2)])
@@ -204,7 +204,7 @@ def test_under_jit_and_vmap():
     np.testing.assert_allclose(traced.values, modes.values, atol=1e-10)
     np.testing.assert_allclose(traced.functions, modes.functions, atol=1e-10)
     scales = jnp.array([1.0, 4.0])
-    values = jax.vmap(lambda s: js.eigenmodes(operator.scaled(s), 4).values)(scales)
+    values = jax.vmap(lambda s: js.eigenmodes(s * operator, 4).values)(scales)
     np.testing.assert_allclose(values, scales[:, None] * modes.values, atol=1e-9)
 
 
@@ -232,7 +232,7 @@ def test_multigrid_gives_the_same(monkeypatch):
     probe = jnp.asarray(np.random.default_rng(0).normal(size=operator.n))
 
     def observed(scale):
-        modes = js.eigenmodes(operator.scaled(1 + scale * probe), 2, degenerate=0.1)
+        modes = js.eigenmodes((1 + scale * probe) * operator, 2, degenerate=0.1)
         return modes.values.sum() + modes.functions[:, 1] @ probe
 
     expected = jax.value_and_grad(observed)(0.0)
@@ -252,6 +252,6 @@ def test_misuse():
         js.eigenmodes(operator, 0)
     with pytest.raises(ValueError, match="began at value 2 and has not ended"):
         js.eigenmodes(operator, 4, degenerate=0.9)
-    broken = operator.scaled(jnp.ones(cloud.n).at[7].set(jnp.nan))
+    broken = jnp.ones(cloud.n).at[7].set(jnp.nan) * operator
     with pytest.raises(ValueError, match="row 7 of the operator is not finite"):
         js.eigenmodes(broken, 4)

@@ -131,7 +131,7 @@ def refitted(points, lists, _):
 
 def solved(points, lists, _):
     """In the points of the operator and of its right-hand side."""
-    screened = js.laplace_beltrami(squeezed(points), lists, method=METHOD).scaled(-1.0).shifted(1.0)
+    screened = 1 - js.laplace_beltrami(squeezed(points), lists, method=METHOD)
     preconditioner = js.jacobi(screened)
     return js.solve(screened, points[:, 2], preconditioner=preconditioner, mean_zero=False).value
 
@@ -222,8 +222,8 @@ def test_the_second_call_compiles_nothing():
     def use(laplacian, gradient):
         vectors = gradient(U)
         laplacian(U), laplacian(vectors), (laplacian @ laplacian)(U)
-        laplacian.transpose()(U), gradient.transpose()(vectors)
-        laplacian.diagonal, laplacian.scaled(2.0), laplacian.shifted(-1.0)
+        laplacian.T(U), gradient.T(vectors)
+        laplacian.diagonal, 2 * laplacian, laplacian - 1
         jax.jvp(laplacian, (U,), (U,)), jax.vjp(gradient, U)[1](vectors)
         jax.grad(lambda u: jnp.sum(laplacian(u) ** 2))(U)
 
@@ -482,16 +482,15 @@ def test_round_off_of_the_input_does_not_matter():
     np.testing.assert_allclose(first, second, atol=1e-10 * float(jnp.abs(first).max()))
 
 
-def test_a_transpose_is_shifted_at_its_own_points():
-    """Slot 0 of a transpose need not be the point itself; a row may lack its own point."""
-    operator = js.laplace_beltrami(CLOUD, LISTS, method=METHOD).transpose()
+def test_stencils_are_shifted_at_their_own_points():
+    """Slot 0 of a stencil need not be the point itself; a row may lack its own point."""
+    operator = js.laplace_beltrami(CLOUD, LISTS, method=METHOD)
     operator = js.Stencil(operator.indices[::-1], operator.weights[::-1])
-    np.testing.assert_allclose(operator.shifted(3.0)(U), operator(U) + 3 * U, atol=1e-9)
+    np.testing.assert_allclose((operator + 3)(U), operator(U) + 3 * U, atol=1e-9)
     ring = js.Stencil((jnp.arange(5)[None] + 1) % 5, jnp.ones((1, 5)))
     u = jnp.arange(5.0)
-    np.testing.assert_allclose(ring.shifted(u)(u), jnp.roll(u, -1) + u * u)
-    with pytest.raises(Exception, match="outside jit"):
-        jax.jit(lambda s: s.shifted(1.0)(u))(ring).block_until_ready()
+    np.testing.assert_allclose((ring + u)(u), jnp.roll(u, -1) + u * u)
+    np.testing.assert_allclose(jax.jit(lambda s: (s + 1)(u))(ring), jnp.roll(u, -1) + u)
 
 
 def test_partial_derivatives_in_other_forms():

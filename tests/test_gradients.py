@@ -96,7 +96,7 @@ def test_field_and_coefficients():
         lambda a: smooth(js.directional_derivative(CLOUD, a, neighbors=neighbors)(FIELD) ** 2),
         VECTOR,
     )
-    check_derivative(lambda s: smooth(laplacian.scaled(s).transpose()(FIELD)), 1.0 + FIELD**2)
+    check_derivative(lambda s: smooth((s * laplacian).T(FIELD)), 1.0 + FIELD**2)
 
 
 @each_kind

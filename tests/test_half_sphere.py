@@ -23,7 +23,7 @@ def half():
 def asked(half, conditions):
     """Everything that solves, under conditions."""
     cloud, laplacian = half
-    screened = laplacian.scaled(-1.0).shifted(1.0)
+    screened = 1 - laplacian
     f = 1.0 + cloud.points[:, 2]
     heat = js.AdvectionDiffusionReaction(laplacian, conditions=conditions)
     gradient = js.surface_gradient(cloud, method=METHOD)
@@ -59,7 +59,7 @@ def test_no_flux(half):
     values = np.asarray(js.eigenmodes(laplacian, 3, conditions=closed).values)
     np.testing.assert_allclose(values, [0, 2, 2], atol=0.02)
     x = cloud.points[:, 0]
-    found = js.solve(laplacian.scaled(-1.0).shifted(1.0), 3 * x, conditions=closed).value
+    found = js.solve(1 - laplacian, 3 * x, conditions=closed).value
     assert float(jnp.abs(found - x).max()) < 0.01
     heat = js.AdvectionDiffusionReaction(laplacian, conditions=closed)
     cooled = js.integrate(heat, x, t1=0.5).ys[-1]
@@ -71,5 +71,5 @@ def test_a_border_that_is_free(half):
     cloud, laplacian = half
     free = js.close(cloud, js.free(cloud.boundary))
     z = cloud.points[:, 2]
-    found = js.solve(laplacian.scaled(-1.0).shifted(1.0), 3 * z, conditions=free)
+    found = js.solve(1 - laplacian, 3 * z, conditions=free)
     assert float(found.stats["relative_residual"]) < 1e-7

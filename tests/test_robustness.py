@@ -174,7 +174,7 @@ VALUES = {
     ),
     "abscissa": (
         lambda p: jnp.array(
-            [100 + js.spectral_estimate(p.laplacian.shifted(p.u - p.u.mean())).abscissa]
+            [100 + js.spectral_estimate(p.laplacian + (p.u - p.u.mean())).abscissa]
         ),
         [EVEN, *UNEVEN[:1]],
         1e-9,

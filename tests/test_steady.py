@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsurf as js
-from jaxsurf.solve.system import Inverse, System
+from jaxsurf.solve.system import System
 
 from .helpers import check_derivative, count_compilations, exponential, relative_error
 
@@ -42,7 +42,7 @@ def test_poisson_on_the_closed_sphere_converges(method, order, bound):
 def test_screened_anisotropic_and_helmholtz(sphere):
     cloud, laplacian, _ = sphere
     u, gradient, lu = exponential(cloud.points)
-    found = js.solve(laplacian.scaled(-1.0).shifted(2.0), 2 * u - lu)
+    found = js.solve(2 - laplacian, 2 * u - lu)
     assert relative_error(found.value, u) < 1e-2
     # div(D grad u) with D = 1 + z/2: grad D is the tangential part of (0, 0, 1/2).
     z = cloud.points[:, 2]
@@ -50,8 +50,8 @@ def test_screened_anisotropic_and_helmholtz(sphere):
     found = js.solve(js.diffusion(cloud, 1 + z / 2), f)
     assert relative_error(_mean_free(found.value), _mean_free(u)) < 2e-2
     # Indefinite: κ² = 4 lies between the eigenvalues 2 and 6.
-    precondition = js.multigrid(laplacian.shifted(-4.0))
-    found = js.solve(laplacian.shifted(4.0), lu + 4 * u, preconditioner=precondition)
+    precondition = js.multigrid(laplacian - 4)
+    found = js.solve(laplacian + 4, lu + 4 * u, preconditioner=precondition)
     assert relative_error(found.value, u) < 2e-2
     assert float(found.stats["relative_residual"]) < 1.5e-8
 
@@ -74,9 +74,9 @@ def test_mean_zero_sense(sphere):
     assert float(jnp.linalg.norm(left)) < 1.5e-8 * float(jnp.linalg.norm(-2 * z + 3.0))
     # The sign of the operator does not matter, nor does the preconditioner.
     other = js.solve(
-        laplacian.scaled(-1.0),
+        -laplacian,
         2 * z - 3.0,
-        preconditioner=js.jacobi(laplacian.scaled(-1.0)),
+        preconditioner=js.jacobi(-laplacian),
         project=True,
     )
     np.testing.assert_allclose(other.value, found.value, atol=1e-6)
@@ -166,7 +166,7 @@ def test_derivatives_with_conditions_and_jacobi(sphere):
     cloud, laplacian, _ = sphere
     z = cloud.points[:, 2]
     cap = np.flatnonzero(z > 0.7)
-    operator = laplacian.scaled(-1.0).shifted(1.0)
+    operator = 1 - laplacian
 
     def total(values, f, weights):
         conditions = js.close(cloud, js.dirichlet(cap, values))
@@ -197,12 +197,12 @@ def test_the_transposed_system_with_flux_conditions():
     laplacian = js.laplace_beltrami(patch, throw=False)
     preconditioner = js.multigrid(laplacian, conditions=conditions)
     assert preconditioner.mean_zero
-    system = System.of(laplacian, conditions, preconditioner.incoming, jnp.float64, True)
+    system = System.of(laplacian, conditions, jnp.float64, True)
     u, v = jnp.asarray(np.random.default_rng(0).normal(size=(2, patch.n)))
-    one, other = jnp.vdot(v, system.mv(u)), jnp.vdot(system.transpose().mv(v), u)
+    one, other = jnp.vdot(v, system.matrix @ u), jnp.vdot(system.matrix.T @ v, u)
     np.testing.assert_allclose(one, other, rtol=1e-11)
-    inverse = Inverse(js.multigrid(laplacian, conditions=conditions, single=False), system)
-    one, other = jnp.vdot(v, inverse.mv(u)), jnp.vdot(inverse.transpose().mv(v), u)
+    inverse = system.inverse(js.multigrid(laplacian, conditions=conditions, single=False))
+    one, other = jnp.vdot(v, inverse @ u), jnp.vdot(inverse.T @ v, u)
     np.testing.assert_allclose(one, other, rtol=1e-11)
 
     found = js.solve(
@@ -313,6 +313,28 @@ def test_bad_input(sphere):
     assert jax.jit(lambda f: solve(f).result)(z.at[9].set(jnp.nan)) == lx.RESULTS.nonfinite_input
 
 
+def test_no_preconditioner_need_be_made_for_gradients(sphere):
+    """Under grad, and twice, as with one made outside; so for reactions."""
+    cloud, laplacian, preconditioner = sphere
+    z = cloud.points[:, 2]
+
+    def total(s, **given):
+        found = js.solve(s * laplacian, laplacian(z), rtol=1e-12, **given).value
+        return jnp.sum(found * z)
+
+    for derivative in (jax.grad(total), jax.grad(jax.grad(total))):
+        plain, given = derivative(2.0), derivative(2.0, preconditioner=preconditioner)
+        np.testing.assert_allclose(plain, given, rtol=1e-9)
+
+    def settled(a):
+        reaction = lambda u, a: u + a * u**3
+        found = js.solve_nonlinear(-laplacian, reaction, 0 * z, args=a, rhs=3 * z, rtol=1e-11)
+        return jnp.sum(found.value * z)
+
+    difference = (settled(1.0 + 1e-4) - settled(1.0 - 1e-4)) / 2e-4
+    np.testing.assert_allclose(jax.grad(settled)(1.0), difference, rtol=1e-6)
+
+
 def test_a_preconditioner_of_other_neighbours_does_not_spoil_the_gradient(sphere):
     cloud, laplacian, _ = sphere
     z = cloud.points[:, 2]
@@ -336,7 +358,7 @@ def test_a_preconditioner_of_other_neighbours_does_not_spoil_the_gradient(sphere
 def test_single_precision():
     cloud = js.sphere(1_000)
     single = js.PointCloud(cloud.points.astype(jnp.float32), cloud.normals.astype(jnp.float32))
-    operator = js.laplace_beltrami(single).scaled(-1.0).shifted(1.0)
+    operator = 1 - js.laplace_beltrami(single)
     z = single.points[:, 2]
     found = js.solve(operator, 3 * z, rtol=1e-4)
     assert found.value.dtype == jnp.float32
@@ -385,7 +407,7 @@ def test_other_operators_and_tolerances_compile_nothing(sphere):
         js.solve(moved, f, project=True)
         js.solve(laplacian, f, rtol=1e-6)
         js.solve(laplacian, 2 * f, atol=1e-3, max_steps=50)
-        js.solve(laplacian.scaled(3.0), f, solver=js.BiCGStab(1e-9))
+        js.solve(3 * laplacian, f, solver=js.BiCGStab(1e-9))
     assert not [name for name in names if "solve" in name], names
 
 

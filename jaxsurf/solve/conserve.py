@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, ArrayLike, Float
 
-from ..arguments import instance, is_concrete, real
+from ..arguments import instance, is_concrete, real, without_derivatives
 from ..compiling import sized_jit
-from ..stencils.stencil import Stencil
+from ..stencils.lineax import Action
+from ..stencils.stencil import Stencil, prepared
 from .krylov import BiCGStab
-from .precondition import AbstractPreconditioner, hierarchy
-from .system import Inverse, System, check_system
+from .precondition import AbstractPreconditioner, multigrid
+from .system import System, check_system
 
 # Relative tolerance of two solves, of which the second takes away what the first one leaves, in
 # units of round-off.
@@ -38,7 +39,8 @@ def conservative_weights(
     Args:
         operator: L, scalar, of a connected closed surface: it annihilates the constants.
         total: what the weights add up to: the area of the surface, `surface.areas.sum()`.
-        preconditioner: from `multigrid(operator)`; made here if None, on concrete operators.
+        preconditioner: from `multigrid(operator)`; made here if None, also under `grad`; not
+            under `jit` and `vmap`.
 
     Returns:
         Weights `(n,)`, in the units of `total`; as `mass=` of a problem in time they make its
@@ -49,8 +51,8 @@ def conservative_weights(
     Differentiable: forward and reverse, in the weights of the operator and in `total`.
     Raises:
         TypeError: no operator or preconditioner.
-        ValueError: an operator with components, one that does not annihilate the constants; a
-            traced one without a preconditioner.
+        ValueError: an operator with components, one that does not annihilate the constants; under
+            `jit` and `vmap`, no preconditioner.
         RuntimeError: no such weights have been found.
 
     Example:
@@ -66,18 +68,14 @@ def conservative_weights(
     real(total, "total", above=0)
     concrete = is_concrete(total, *jax.tree.leaves((operator, preconditioner)))
     if preconditioner is None:
-        if not is_concrete(*jax.tree.leaves(operator)):
-            raise ValueError(
-                "operator is traced: pass a preconditioner made outside by js.multigrid(operator)"
-            )
-        preconditioner = hierarchy(operator, None)
+        preconditioner = multigrid(without_derivatives(operator))
     if preconditioner.mean_zero is False:
         raise ValueError(
             "operator does not annihilate the constants: no weights are conserved, as where heat "
             "passes through a border or is lost"
         )
     total = jnp.asarray(total, jnp.result_type(float, *jax.tree.leaves(operator)))
-    weights, left = _weights(operator, total, preconditioner)
+    weights, left = _weights(prepared(operator), total, preconditioner)
     allowed = _LEFT * float(jnp.finfo(weights.dtype).eps)
     text = (
         "weights that conserve the mass have been found to {} of round-off only, {:.0e} is needed: "
@@ -95,13 +93,13 @@ def _weights(operator, total, preconditioner):
     """The weights, and what is left of their products with the columns, of the sums of moduli."""
     # S = L - σ p pᵀ / n, p = 1, is not singular, and Sᵀ m = -σ total / n where Lᵀ m = 0.
     dtype = total.dtype
-    system = System.of(operator, None, preconditioner.incoming, dtype, True)
-    adjoint, fixed = system.transpose(), jax.lax.stop_gradient(system.transpose())
-    inverse = jax.lax.stop_gradient(Inverse(preconditioner, system)).transpose()
-    options = {"preconditioner": inverse}
+    system = System.of(operator, None, dtype, True)
+    adjoint = Action(system.matrix.T, dtype)
+    fixed, inverse = jax.lax.stop_gradient((adjoint, system.inverse(preconditioner).T))
+    options = {"preconditioner": Action(inverse, dtype)}
     solver = BiCGStab(_SOLVED * float(jnp.finfo(dtype).eps))
     sigma = jnp.asarray(system.sigma)
-    rhs = system.constant(-sigma * total / operator.n)
+    rhs = system.constant(-sigma * total / operator.n, dtype)
 
     def solved(matrix, b):
         return lx.linear_solve(matrix, b, solver, options=options, throw=False).value

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..arguments import instance, is_concrete, real, whole
 from ..boundary import Closure, check_border
-from ..stencils.stencil import AbstractOperator, check_scalar
+from ..stencils.algebra import AbstractOperator, check_scalar
 from . import invariant
 from .invariant import Subspace
 
@@ -126,12 +126,10 @@ class _System(eqx.Module):
     def of(operator: AbstractOperator, conditions: Closure | None) -> _System:
         if conditions is None:
             return _System(operator, jnp.ones(operator.n, bool))
-        stencil, free = _interior(conditions)
-        return _System(operator @ stencil, free)
+        return _System(conditions.reduce(operator), _free(conditions))
 
     def __call__(self, fields: Float[Array, "n c"]) -> Float[Array, "n c"]:
-        free = self.free[:, None]
-        return -jnp.where(free, self.operator(jnp.where(free, fields, 0)), 0)
+        return -self.operator(fields)
 
     def to_scipy(self):
         """The matrix of the free points, and which they are."""
@@ -140,9 +138,8 @@ class _System(eqx.Module):
 
 
 @eqx.filter_jit
-def _interior(conditions: Closure):
-    """E, which fills in bound points, and where the free ones are: in one program."""
-    return conditions.stencil, ~conditions.bound
+def _free(conditions: Closure) -> Bool[Array, " n"]:
+    return ~conditions.bound
 
 
 # --- the rule -------------------------------------------------------------------------------

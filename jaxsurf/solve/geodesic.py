@@ -22,11 +22,11 @@ from ..compiling import sized_jit
 from ..discretization import Discretization
 from ..neighbors import Neighbors, find_neighbors
 from ..stencils.gfdm import GFDM
+from ..stencils.lineax import Action
 from ..stencils.method import AbstractMethod
 from ..stencils.stencil import Stencil
 from .krylov import BiCGStab
-from .precondition import AbstractPreconditioner, multigrid
-from .system import Inverse, System
+from .precondition import multigrid
 
 # From this distance of their mean, in units of their root mean square, neighbours are one-sided.
 _ONE_SIDED = 0.45
@@ -113,18 +113,19 @@ def geodesic_distance(
     with jax.ensure_compile_time_eval():  # of the lists alone, also where points are traced
         share = _shares(mask).astype(cloud.points.dtype)
         fixed = np.isin(np.arange(cloud.n), near)
-        preconditioner = _preconditioner(indices, share, fixed)
+        traced = not is_concrete(cloud.points, cloud.normals)
+        inverse = _preconditioner(indices, share, fixed, traced)
         known = jax.device_put((share, fixed, near, owners, sources.astype(np.int32)))
     surface = Discretization(cloud, neighbors, method)
     plain = (surface.laplacian.weights, surface.gradient.weights)
     scale = np.asarray(smoothing, cloud.points.dtype)
     return _distances(
-        cloud.points, cloud.normals, neighbors, plain, path, known, preconditioner, scale, rtol
+        cloud.points, cloud.normals, neighbors, plain, path, known, inverse, scale, rtol
     )
 
 
 @sized_jit
-def _distances(points, normals, neighbors, plain, path, known, preconditioner, smoothing, rtol):
+def _distances(points, normals, neighbors, plain, path, known, inverse, smoothing, rtol):
     """All that is done on the device, in one program; rtol is static."""
     share, fixed, near, owners, sources = known
     indices = neighbors.indices.T
@@ -134,7 +135,7 @@ def _distances(points, normals, neighbors, plain, path, known, preconditioner, s
     laplacian = jnp.where(mixed, _random_walk(points, indices, share), laplacian)
     # The operators on v: similar to those on u, whatever the path.
     growth = jnp.exp((path - path[indices]) / spacing)
-    heat = Stencil(indices, laplacian * growth).scaled(-(spacing**2)).shifted(1.0)
+    heat = 1 - spacing**2 * Stencil(indices, laplacian * growth)
     start = jnp.zeros_like(path).at[sources].set(1)
     v = _warm(heat, start, rtol)
     flow = Stencil(indices, -gradient * growth[:, None], (points.shape[1],))(v)
@@ -147,9 +148,7 @@ def _distances(points, normals, neighbors, plain, path, known, preconditioner, s
     from_others = _unit(Stencil(indices, others)(direction))
     direction = jnp.where(replaced[:, None], from_others, direction).at[near].set(away)
     value = jnp.zeros_like(path).at[near].set(distance)
-    return _integrate(
-        points, normals, indices, share, direction, fixed, value, preconditioner, rtol
-    )
+    return _integrate(points, normals, indices, share, direction, fixed, value, inverse, rtol)
 
 
 def _random_walk(points, indices, share):
@@ -239,12 +238,13 @@ def _differences(indices, share, fixed) -> Stencil:
     return Stencil(indices, own - share * ~(fixed | fixed[indices]))
 
 
-def _preconditioner(indices, share, fixed) -> AbstractPreconditioner:
+def _preconditioner(indices, share, fixed, differentiated: bool):
+    """Of the differences, and the table of their transpose where it is needed."""
     operator = _differences(np.ascontiguousarray(indices.T), share, fixed)
-    return jax.device_put(multigrid(operator))
+    return jax.device_put(multigrid(operator)), operator.prepared.table if differentiated else None
 
 
-def _integrate(x, normals, indices, share, direction, fixed, value, preconditioner, rtol):
+def _integrate(x, normals, indices, share, direction, fixed, value, inverse, rtol):
     """The field whose differences fit the directions and which has given values near sources."""
 
     def add_slot(total, slot):
@@ -254,13 +254,14 @@ def _integrate(x, normals, indices, share, direction, fixed, value, precondition
         return total - w * (_bent(chord, normals[j] - normals) * step - value[j]), None
 
     rhs, _ = jax.lax.scan(add_slot, jnp.zeros_like(value), (indices, share))
-    # The layout's own indices, which are the same, need no comparison.
-    layout = preconditioner.incoming
-    operator = _differences(layout.indices, share, fixed)
-    system = System(operator, None, None, layout, rhs.dtype)
-    options = {"preconditioner": Inverse(preconditioner, system)}
+    preconditioner, table = inverse
+    operator = eqx.tree_at(
+        lambda s: s.table, _differences(indices, share, fixed), table, is_leaf=lambda x: x is None
+    )
+    options = {"preconditioner": Action(preconditioner, rhs.dtype)}
+    matrix = Action(operator, rhs.dtype)
     rhs = jnp.where(fixed, 0, rhs)
-    found = lx.linear_solve(system, rhs, BiCGStab(rtol), options=options, throw=False)
+    found = lx.linear_solve(matrix, rhs, BiCGStab(rtol), options=options, throw=False)
     free = eqx.error_if(
         found.value,
         found.result != lx.RESULTS.successful,

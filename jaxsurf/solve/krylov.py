@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..arguments import is_concrete, real, whole
@@ -23,7 +24,7 @@ class BiCGStab(lx.AbstractLinearSolver):
     residual computed afresh: where the one carried along by recursion has drifted away from it,
     and where the recursion breaks down, the iteration starts again from the last iterate. (The
     solver of the same name in lineax compares component by component, which no right-hand
-    side that passes through zero can meet.)
+    side that passes through zero can meet.) Fields may be any pytree.
 
     Args:
         rtol: tolerance relative to the norm of the right-hand side.
@@ -59,16 +60,19 @@ class BiCGStab(lx.AbstractLinearSolver):
         return lx.linearise(operator)
 
     def compute(self, state, vector, options):
+        b, unravel = ravel_pytree(vector)
+        flat = lambda f: lambda x: ravel_pytree(f(unravel(x)))[0]
         preconditioner = options.get("preconditioner")
-        apply = state.mv
-        precondition = (lambda r: r) if preconditioner is None else preconditioner.mv
+        apply = flat(state.mv)
+        precondition = (lambda r: r) if preconditioner is None else flat(preconditioner.mv)
+        finite = jnp.all(jnp.isfinite(b))
         # At size one, as squares of 1e-300 are zero.
-        scale = scale_of(vector)
-        b = vector / scale
+        scale = scale_of(b)
+        b = b / scale
         target = jnp.maximum(self.rtol * jnp.linalg.norm(b), self.atol / scale)
         x, r = jnp.zeros_like(b), b
         if "y0" in options:
-            x = options["y0"] / scale
+            x = ravel_pytree(options["y0"])[0] / scale
             r = b - apply(x)
 
         def pass_(carry):
@@ -95,8 +99,8 @@ class BiCGStab(lx.AbstractLinearSolver):
             steps >= self.max_steps, _Results.max_steps_reached, _Results.stagnation
         )
         result = _Results.where(size <= target, _Results.successful, result)
-        result = _Results.where(jnp.all(jnp.isfinite(vector)), result, _Results.nonfinite_input)
-        return scale * x, result, {"num_steps": steps, "max_steps": self.max_steps}
+        result = _Results.where(finite, result, _Results.nonfinite_input)
+        return unravel(scale * x), result, {"num_steps": steps, "max_steps": self.max_steps}
 
     def transpose(self, state, options):
         turned = {}
@@ -115,12 +119,6 @@ def scale_of(x: Float[Array, " n"]) -> Float[Array, ""]:
     """The largest modulus; one if that is zero or no number."""
     size = jnp.max(jnp.abs(x))
     return jax.lax.stop_gradient(jnp.where((size > 0) & jnp.isfinite(size), size, 1))
-
-
-def norm(x: Float[Array, " n"]) -> Float[Array, ""]:
-    """The 2-norm, of tiny and of huge numbers too."""
-    scale = scale_of(x)
-    return scale * jnp.linalg.norm(x / scale)
 
 
 def tolerances_as_arrays(solver):

@@ -11,18 +11,18 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
-import scipy.sparse
 from jaxtyping import Array, Float
 
-from ..arguments import as_float, is_concrete, whole
+from ..arguments import as_float, is_concrete, whole, without_derivatives
 from ..boundary import Closure
 from ..compiling import sized_jit
 from ..functions import canonical, numbers_as_arrays
-from ..stencils.stencil import AbstractOperator, Stencil
+from ..stencils.algebra import AbstractOperator, Map
+from ..stencils.lineax import Action
+from ..stencils.stencil import prepared
 from .krylov import BiCGStab, tolerances_as_arrays
-from .padded import matching_layout
 from .precondition import AbstractPreconditioner, multigrid
-from .system import Inverse, Linearised, System, check_system, tolerance
+from .system import System, check_system, tolerance
 
 # A step is accepted if the residual falls by this share of what the linear model promises.
 _ARMIJO = 1e-4
@@ -62,8 +62,8 @@ def solve_nonlinear(
         args: parameters of the reaction, any pytree; derivatives in them need them here.
         rhs: f, `(n,)` or a number.
         conditions: from `js.close` or `js.with_ghosts`.
-        preconditioner: for $L + r'$; `js.multigrid` of it at u0 if None, which takes concrete
-            arrays. One serves all steps.
+        preconditioner: for $L + r'$; `js.multigrid` of it at u0 if None, also under
+            `grad`; not under `jit` and `vmap`. One serves all steps.
         solver: of the linear systems; `js.BiCGStab` if None, loosely but for derivatives.
         rtol: the residual may be this share of its size at u0 (or of f, if that is larger);
             1e-8 in double and 1e-4 in single precision if None.
@@ -87,7 +87,7 @@ def solve_nonlinear(
     Example:
         >>> cloud = js.sphere(1_000)
         >>> z = cloud.points[:, 2]
-        >>> screened = js.laplace_beltrami(cloud).scaled(-1.0)
+        >>> screened = -js.laplace_beltrami(cloud)
         >>> f = 2 * z + z + z**3
         >>> u = js.solve_nonlinear(screened, lambda u, _: u + u**3, 0 * z, rhs=f).value
         >>> bool(jnp.abs(u - z).max() < 0.01)
@@ -117,19 +117,21 @@ def solve_nonlinear(
     reaction = canonical(reaction, u0, args)
     problem = _Problem(operator, conditions, reaction, args, rhs)
     if preconditioner is None:
-        preconditioner = multigrid(_shifted(operator, problem.slope(u0)), conditions=conditions)
+        shifted, known = without_derivatives((operator + problem.slope(u0), conditions))
+        preconditioner = multigrid(shifted, conditions=known)
     if preconditioner.mean_zero:
         raise ValueError(
             "singular at u0: the operator annihilates the constants and the reaction has slope "
             "zero. Start elsewhere, or solve a linear problem with js.solve"
         )
-    layout = matching_layout(preconditioner.incoming, operator)
     concrete = is_concrete(*jax.tree.leaves((problem, u0, preconditioner)))
+    if not concrete:  # nothing concrete is differentiated
+        problem = eqx.tree_at(lambda p: p.operator, problem, prepared(operator))
     numbers = np.asarray(rtol), np.asarray(float(atol)), np.asarray(max_steps)
     solver = None if solver is None else tolerances_as_arrays(solver)
     # Errors of concrete problems are raised here: they share one program, whatever `throw` is.
     flags = concrete, throw and not concrete
-    solution = _solve(problem, u0, layout, preconditioner, solver, *numbers, *flags)
+    solution = _solve(problem, u0, preconditioner, solver, *numbers, *flags)
     if throw and concrete and bool(solution.result != optx.RESULTS.successful):
         raise RuntimeError(
             f"not solved: relative residual {float(solution.stats['relative_residual']):.1e} after "
@@ -161,14 +163,14 @@ class _Problem(eqx.Module):
         u = self.field(v)
         return jax.jvp(lambda u: self.reaction(u, self.args), (u,), (jnp.ones_like(u),))[1]
 
-    def correction(self, v, residual, layout, preconditioner, solver):
+    def correction(self, v, residual, preconditioner, solver):
         """The solution of (L + r') delta = residual; what it is linearised at is a constant."""
         fixed, v = _constant((self, v))
         slope = _Slope(fixed.reaction, fixed.args, fixed.field(v))
-        operator, conditions = Linearised(fixed.operator, slope), fixed.conditions
-        system = System.of(operator, conditions, layout, v.dtype, False)
-        options = {"preconditioner": _constant(Inverse(preconditioner, system))}
-        return lx.linear_solve(system, residual, solver, options=options, throw=False)
+        system = System(fixed.operator + Map(slope, len(v)), fixed.conditions)
+        options = {"preconditioner": Action(_constant(preconditioner), v.dtype)}
+        matrix = Action(system.matrix, v.dtype)
+        return lx.linear_solve(matrix, residual, solver, options=options, throw=False)
 
 
 class _State(eqx.Module):
@@ -181,7 +183,7 @@ class _State(eqx.Module):
 
 
 @sized_jit
-def _solve(problem, u0, layout, preconditioner, solver, rtol, atol, max_steps, concrete, throw):
+def _solve(problem, u0, preconditioner, solver, rtol, atol, max_steps, concrete, throw):
     fixed = _constant(problem)
     loose = BiCGStab(_FORCING, 0.0, 1000) if solver is None else solver
     start = fixed.residual(jax.lax.stop_gradient(u0))
@@ -191,7 +193,7 @@ def _solve(problem, u0, layout, preconditioner, solver, rtol, atol, max_steps, c
     target = jnp.maximum(rtol * scale, atol)
 
     def step(state):
-        found = fixed.correction(state.v, state.residual, layout, preconditioner, loose)
+        found = fixed.correction(state.v, state.residual, preconditioner, loose)
 
         def trial(t):
             v = state.v + t * found.value
@@ -230,7 +232,7 @@ def _solve(problem, u0, layout, preconditioner, solver, rtol, atol, max_steps, c
         # One more Newton step has the derivative of the solution; its value is below the tolerance.
         finest = tolerance(None, u0.dtype)
         tight = BiCGStab(jnp.minimum(rtol, finest), 0.0, 1000) if solver is None else solver
-        last = problem.correction(v, problem.residual(v), layout, preconditioner, tight).value
+        last = problem.correction(v, problem.residual(v), preconditioner, tight).value
         v = v + last - jax.lax.stop_gradient(last)
     u = problem.field(v)
     if throw:
@@ -253,10 +255,6 @@ def _constant(tree):
     return eqx.combine(jax.lax.stop_gradient(arrays), rest)
 
 
-def _shifted(operator, term):
-    return operator.shifted(term) if isinstance(operator, Stencil) else _Sum(operator, term)
-
-
 class _Slope(eqx.Module):
     """The derivative of a reaction at u, as a linear map."""
 
@@ -266,25 +264,3 @@ class _Slope(eqx.Module):
 
     def __call__(self, tangent):
         return jax.jvp(lambda u: self.reaction(u, self.args), (self.u,), (tangent,))[1]
-
-
-class _Sum(AbstractOperator):
-    """An operator plus a multiple of the identity that varies from point to point."""
-
-    operator: AbstractOperator
-    term: Array
-    in_shape = ()
-    out_shape = ()
-
-    @property
-    def n(self):
-        return self.operator.n
-
-    def __call__(self, u):
-        return self.operator(u) + self.term * u
-
-    def transpose(self):
-        return _Sum(self.operator.transpose(), self.term)
-
-    def to_scipy(self):
-        return (self.operator.to_scipy() + scipy.sparse.diags(np.asarray(self.term))).tocsr()

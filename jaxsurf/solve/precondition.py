@@ -11,10 +11,11 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float
 
-from ..arguments import instance, is_concrete
+from ..arguments import instance
 from ..boundary import Closure
-from ..stencils.stencil import AbstractOperator, Composition, Stencil, check_scalar
-from .padded import Layout, PaddedMatrix, incoming_layout
+from ..stencils.algebra import AbstractOperator, Composition, check_scalar
+from ..stencils.padded import PaddedMatrix
+from ..stencils.stencil import Stencil
 from .reduced import annihilates_constants, reduced_matrix
 
 # The coarsest system has at most this many unknowns and is solved by a dense inverse.
@@ -29,11 +30,10 @@ _STRENGTH = 0.05
 _SMOOTHED = 0.25
 
 
-class AbstractPreconditioner(eqx.Module):
+class AbstractPreconditioner(AbstractOperator):
     """A cheap approximation of the inverse of an operator.
 
     Args:
-        incoming: layout of the operator's transpose, for adjoint solves; None if unknown.
         mean_zero: the operator annihilates the constants; None if unknown.
 
     Example:
@@ -42,30 +42,20 @@ class AbstractPreconditioner(eqx.Module):
         True
     """
 
-    incoming: Layout
     mean_zero: bool | None = eqx.field(static=True)
+    in_shape = ()
+    out_shape = ()
 
     @abc.abstractmethod
     def __call__(self, r: Float[Array, " n"]) -> Float[Array, " n"]:
         """An approximate solution u of A u = r; linear in r."""
-
-    @abc.abstractmethod
-    def transpose(self) -> AbstractPreconditioner:
-        """The exact transpose, which serves the transposed operator."""
-
-
-def without_layout(preconditioner: AbstractPreconditioner) -> AbstractPreconditioner:
-    """The same, to be applied only: the layout of adjoint solves goes another way."""
-    return eqx.tree_at(
-        lambda p: p.incoming, preconditioner, None, is_leaf=lambda x: x is preconditioner.incoming
-    )
 
 
 class Jacobi(AbstractPreconditioner):
     """Division by the diagonal. Needs no set-up, and works on traced operators.
 
     Args:
-        diagonal: of the operator, `(n,)`.
+        divisor: the diagonal of the operator, `(n,)`.
 
     Example:
         >>> laplacian = js.laplace_beltrami(js.sphere(300))
@@ -74,10 +64,14 @@ class Jacobi(AbstractPreconditioner):
         True
     """
 
-    diagonal: Float[Array, " n"]
+    divisor: Float[Array, " n"]
+
+    @property
+    def n(self):
+        return len(self.divisor)
 
     def __call__(self, r):
-        return r / self.diagonal
+        return r / self.divisor
 
     def transpose(self):
         return self
@@ -139,6 +133,10 @@ class Multigrid(AbstractPreconditioner):
     coarsest: Float[Array, "m m"]
 
     @property
+    def n(self):
+        return self.sizes[0]
+
+    @property
     def sizes(self) -> tuple[int, ...]:
         """Room on every level, from fine to coarse: what it is padded to."""
         return (*(level.n for level in self.levels), len(self.coarsest))
@@ -171,7 +169,7 @@ class Multigrid(AbstractPreconditioner):
             Level(v.turned, v.matrix, v.inverse, v.restrict, v.prolong, v.damping)
             for v in self.levels
         )
-        return Multigrid(self.incoming, self.mean_zero, levels, self.coarsest.T)
+        return Multigrid(self.mean_zero, levels, self.coarsest.T)
 
 
 class _Product(AbstractPreconditioner):
@@ -183,7 +181,11 @@ class _Product(AbstractPreconditioner):
     @classmethod
     def of(cls, outer, inner):
         mean_zero = bool(outer.mean_zero or inner.mean_zero)
-        return cls((outer.incoming, inner.incoming), mean_zero, outer, inner)
+        return cls(mean_zero, outer, inner)
+
+    @property
+    def n(self):
+        return self.outer.n
 
     def __call__(self, r):
         return self.inner(self.outer(r))
@@ -209,18 +211,15 @@ def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> 
         ValueError: a composition of operators, or one with components.
 
     Example:
-        >>> screened = js.laplace_beltrami(js.sphere(500)).scaled(-1.0).shifted(1.0)
-        >>> bool((js.jacobi(screened).diagonal > 0).all())
+        >>> screened = 1 - js.laplace_beltrami(js.sphere(500))
+        >>> bool((js.jacobi(screened).divisor > 0).all())
         True
     """
     _check_kinds(operator, conditions)
-    if not isinstance(operator, Stencil):
-        raise ValueError(f"the diagonal of a {type(operator).__name__} is not at hand")
     diagonal = operator.diagonal
     if conditions is not None:
         diagonal = jnp.where(conditions.bound, 1, diagonal)
-    incoming = incoming_layout(operator) if is_concrete(operator.indices) else None
-    return Jacobi(incoming, None, jax.lax.stop_gradient(diagonal))
+    return Jacobi(None, jax.lax.stop_gradient(diagonal))
 
 
 def multigrid(
@@ -259,7 +258,9 @@ def multigrid(
         1
     """
     _check_kinds(operator, conditions)
-    return hierarchy(operator, conditions, single=single)
+    if isinstance(operator, Composition) and conditions is None:
+        return _Product.of(*(multigrid(o, single=single) for o in (operator.outer, operator.inner)))
+    return _hierarchy(operator, conditions, single)
 
 
 def _check_kinds(operator, conditions) -> None:
@@ -270,14 +271,7 @@ def _check_kinds(operator, conditions) -> None:
         instance(conditions, Closure, "conditions", hint)
 
 
-def hierarchy(operator, conditions, *, single: bool = True, layout: bool = True):
-    """`multigrid`, with or without the layout for adjoint solves."""
-    if isinstance(operator, Composition) and conditions is None:
-        outer, inner = (
-            hierarchy(o, None, single=single, layout=layout)
-            for o in (operator.outer, operator.inner)
-        )
-        return _Product.of(outer, inner)
+def _hierarchy(operator, conditions, single: bool) -> Multigrid:
     matrix = reduced_matrix(operator, conditions)
     mean_zero = annihilates_constants(matrix, conditions)
     dtype = np.dtype(np.float32) if single else matrix.dtype
@@ -303,8 +297,7 @@ def hierarchy(operator, conditions, *, single: bool = True, layout: bool = True)
     coarsest = np.zeros((room, room), dtype)
     part = slice(fine.shape[0])
     coarsest[part, part] = _inverse(fine, constant if mean_zero else None)
-    incoming = incoming_layout(operator) if layout else None
-    return Multigrid(incoming, mean_zero, tuple(levels), jnp.asarray(coarsest))
+    return Multigrid(mean_zero, tuple(levels), jnp.asarray(coarsest))
 
 
 # --- set-up on the host --------------------------------------------------------------------

@@ -22,8 +22,8 @@ def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
     leaves = jax.tree.leaves((operator, conditions))
     if not is_concrete(*leaves):
         raise ValueError(
-            "multigrid is set up on concrete arrays: call js.multigrid or js.step_preconditioner "
-            "outside jit and grad, and pass its result as `preconditioner`"
+            "multigrid is set up on arrays whose values are known: call js.multigrid or "
+            "js.step_preconditioner outside jit and vmap, and pass its result as `preconditioner`"
         )
     matrix = operator.to_scipy()
     if not np.isfinite(matrix.data).all():
@@ -32,8 +32,7 @@ def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
     if conditions is not None:
         if conditions.n != operator.n:
             raise ValueError(f"conditions for {conditions.n} points, the operator has {operator.n}")
-        free = scipy.sparse.diags((~np.asarray(conditions.bound)).astype(matrix.dtype))
-        matrix = (free @ matrix @ conditions.to_scipy()).tocsr()
+        matrix = conditions.reduce(operator).to_scipy()
         matrix.eliminate_zeros()
     return matrix
 

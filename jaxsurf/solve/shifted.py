@@ -9,8 +9,9 @@ import scipy.sparse
 from jaxtyping import Array, ArrayLike, Float
 
 from ..boundary import Closure
-from ..stencils.stencil import AbstractOperator, Stencil, check_scalar
-from .padded import PaddedMatrix
+from ..stencils.algebra import AbstractOperator, check_scalar
+from ..stencils.padded import PaddedMatrix
+from ..stencils.stencil import Stencil
 from .precondition import (
     USED,
     Level,
@@ -80,7 +81,7 @@ class ShiftedMultigrid(eqx.Module):
         """The V-cycle for one g, which may be traced."""
         g = jnp.asarray(g).astype(self.mass.dtype)
         levels = tuple(pair.at(g) for pair in self.pairs)
-        return Multigrid(None, False, levels, jnp.linalg.inv(self.mass - g * self.stiff))
+        return Multigrid(False, levels, jnp.linalg.inv(self.mass - g * self.stiff))
 
 
 def shifted_multigrid(

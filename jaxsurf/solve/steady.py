@@ -11,15 +11,16 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..arguments import as_float, is_concrete, whole
+from ..arguments import as_float, is_concrete, whole, without_derivatives
 from ..boundary import Closure
 from ..compiling import sized_jit
-from ..stencils.stencil import AbstractOperator
+from ..stencils.algebra import AbstractOperator
+from ..stencils.lineax import Action
+from ..stencils.stencil import prepared
 from .krylov import BiCGStab, scale_of, tolerances_as_arrays
-from .padded import matching_layout
-from .precondition import AbstractPreconditioner, hierarchy, without_layout
+from .precondition import AbstractPreconditioner, multigrid
 from .reduced import annihilates_constants, reduced_matrix
-from .system import Inverse, System, check_system, tolerance
+from .system import System, check_system, tolerance
 
 # An incompatible part may be this share of what of the right-hand side is not resolved,
 _UNRESOLVED = 0.25
@@ -62,9 +63,9 @@ def solve(
             will, or a composition.
         rhs: f, `(n,)` or `(n, c)` for c problems at once; values at bound points do not count.
         conditions: from `js.close` or `js.with_ghosts`.
-        preconditioner: `js.multigrid(operator, conditions=conditions)` if None, which takes
-            concrete arrays: under `jit` and `grad` make it outside and pass it. Or
-            `js.jacobi(operator)`.
+        preconditioner: `js.multigrid(operator, conditions=conditions)` if None, also under
+            `grad`; under `jit` and `vmap`, where values are not known, make it outside and pass
+            it. Or `js.jacobi(operator)`.
         solver: a solver of lineax; `js.BiCGStab(rtol, atol, max_steps)` if None.
         mean_zero: whether A annihilates the constants; seen from the preconditioner or a
             concrete operator if None.
@@ -111,17 +112,17 @@ def solve(
     given, rtol = rtol is not None, tolerance(rtol, rhs.dtype)
     whole(max_steps, "max_steps", least=1)
     concrete = is_concrete(*jax.tree.leaves((operator, rhs, conditions, preconditioner)))
+    known = without_derivatives((operator, conditions))
     if preconditioner is None:
-        # Nothing concrete is differentiated: no layout for adjoint solves is needed.
-        preconditioner = hierarchy(operator, conditions, layout=not concrete)
+        preconditioner = multigrid(known[0], conditions=known[1])
     if mean_zero is None:
-        mean_zero = _is_mean_zero(operator, conditions, preconditioner)
+        mean_zero = _is_mean_zero(*known, preconditioner)
     if solver is None:
         solver = BiCGStab(rtol, float(atol), np.asarray(max_steps))
-    layout = None if concrete else matching_layout(preconditioner.incoming, operator)
-    preconditioner = without_layout(preconditioner)
+    if not concrete:  # nothing concrete is differentiated
+        operator = prepared(operator)
     limits = np.asarray(rtol), np.asarray(float(atol)), np.asarray(given), np.asarray(bool(project))
-    problem = (operator, layout, conditions, preconditioner, tolerances_as_arrays(solver), limits)
+    problem = (operator, conditions, preconditioner, tolerances_as_arrays(solver), limits)
     solution = _solve(rhs, *problem, bool(mean_zero), throw and not concrete)
     if throw and concrete:
         _raise_on_failure(solution, rhs.dtype, rtol, atol)
@@ -129,22 +130,23 @@ def solve(
 
 
 @sized_jit
-def _solve(rhs, operator, layout, conditions, preconditioner, solver, limits, mean_zero, throw):
-    problem = (operator, layout, conditions, preconditioner, solver, limits, mean_zero, throw)
+def _solve(rhs, operator, conditions, preconditioner, solver, limits, mean_zero, throw):
+    problem = (operator, conditions, preconditioner, solver, limits, mean_zero, throw)
     if rhs.ndim == 1:
         return _solve_one(rhs, *problem)
     columns = lx.Solution(1, 0, 0, 0)  # type: ignore[arg-type]
     return jax.vmap(lambda f: _solve_one(f, *problem), 1, columns)(rhs)
 
 
-def _solve_one(rhs, operator, layout, conditions, preconditioner, solver, limits, mean_zero, throw):
+def _solve_one(rhs, operator, conditions, preconditioner, solver, limits, mean_zero, throw):
     rtol, atol, given, project = limits
-    system = System.of(operator, conditions, layout, rhs.dtype, mean_zero)
+    system = System.of(operator, conditions, rhs.dtype, mean_zero)
     offset = jnp.zeros_like(rhs) if conditions is None else conditions.offset()
     known = rhs if conditions is None else system.free(rhs - operator(offset))
-    inverse = Inverse(preconditioner, system)
-    options = {"preconditioner": jax.lax.stop_gradient(inverse)}
-    found = lx.linear_solve(system, known, solver, options=options, throw=False)
+    inverse = jax.lax.stop_gradient(system.inverse(preconditioner))
+    options = {"preconditioner": Action(inverse, rhs.dtype)}
+    matrix = Action(system.matrix, rhs.dtype)
+    found = lx.linear_solve(matrix, known, solver, options=options, throw=False)
 
     v = found.value
     u = v if conditions is None else conditions.homogeneous(v) + offset
@@ -155,9 +157,9 @@ def _solve_one(rhs, operator, layout, conditions, preconditioner, solver, limits
     scale = scale_of(b)
     b, v = b / scale, v / scale
     signs = 1.0 - 2.0 * (jnp.arange(operator.n) % 2).astype(v.dtype)
-    products = fixed.products(jnp.stack([v, signs * v, b], axis=1))
+    products = fixed.reduced(jnp.stack([v, signs * v, b], axis=1))
     incompatible = fixed.shift(v)
-    left = b - fixed.constant(incompatible) - products[:, 0]
+    left = b - fixed.constant(incompatible, b.dtype) - products[:, 0]
     residual, size = jnp.linalg.norm(left), jnp.linalg.norm(b)
     # The rounding of every u_j changes A u by this much. Where that is much of the right-hand side,
     # as u has grown in a system that is singular, it excuses nothing.

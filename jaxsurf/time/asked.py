@@ -14,7 +14,7 @@ from jaxtyping import Array, PyTree
 
 from ..arguments import as_float, is_concrete, raise_at, real
 from ..boundary import check_border
-from ..stencils.stencil import AbstractOperator
+from ..stencils.algebra import AbstractOperator
 from .coefficients import user
 from .pde import AbstractEvolution, AdvectionDiffusionReaction, WaveEquation
 from .states import dtype_of

@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ..arguments import as_float, finite, instance, is_concrete, raise_at, real
 from ..boundary import Closure
 from ..functions import numbers_as_arrays
-from ..stencils.stencil import AbstractOperator
+from ..stencils.algebra import AbstractOperator
 
 InTime = ArrayLike | Callable[[Any], Any]
 

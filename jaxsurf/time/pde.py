@@ -12,7 +12,8 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ..arguments import as_float, finite, instance, is_concrete
 from ..boundary import Closure
-from ..stencils.stencil import AbstractOperator, Stencil
+from ..stencils.algebra import AbstractOperator
+from ..stencils.stencil import Stencil
 from .coefficients import (
     InTime,
     check_closure,

@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ..arguments import instance
 from ..solve.precondition import Multigrid
 from ..solve.shifted import ShiftedMultigrid, shifted_multigrid
-from ..solve.system import Square, matrix_free
+from ..stencils.lineax import Square, matrix_free
 from .pde import AbstractEvolution, AdvectionDiffusionReaction, BiharmonicDiffusion, CahnHilliard
 
 

@@ -11,9 +11,10 @@ from ..cloud import PointCloud
 from ..neighbors import Neighbors, find_neighbors
 from ..operators import diffusion
 from ..spectrum import spectral_estimate
+from ..stencils.algebra import AbstractOperator
 from ..stencils.dcpse import DCPSE
 from ..stencils.method import AbstractMethod
-from ..stencils.stencil import AbstractOperator, Stencil
+from ..stencils.stencil import Stencil
 from .coefficients import check_operator
 
 
@@ -64,7 +65,7 @@ def hyperviscosity(
     else:
         spectral_radius = spectral_estimate(laplacian).radius
     factor = strength * jnp.asarray(speed) * spectral_radius ** (0.5 - power)
-    damping: AbstractOperator = laplacian.scaled(-((-1) ** power) * factor)
+    damping: AbstractOperator = -((-1) ** power) * factor * laplacian
     for _ in range(power - 1):
         damping = damping @ laplacian
     return damping

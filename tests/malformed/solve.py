@@ -114,7 +114,7 @@ CASES = [
          ("operator", "outer")),
     Case("conservative_weights", "a function as preconditioner",
          lambda: conserved(preconditioner=jnp.sin), ("preconditioner", "js.multigrid")),
-    Case("conservative_weights", "heat that is lost", lambda: conserved(laplacian().shifted(-1.0)),
+    Case("conservative_weights", "heat that is lost", lambda: conserved(laplacian() - 1),
          ("operator", "constants")),
     Case("conservative_weights", "a border about which nothing is said",
          lambda: conserved(marked()), ("border",)),

@@ -70,15 +70,15 @@ CASES = [
         ),
         (
             "weights of 1e200",
-            estimate(lambda: operator().scaled(1e200)),
+            estimate(lambda: 1e200 * operator()),
             lambda s: abs(s.radius / 4e200 - 1) < 0.02,
         ),
         (
             "weights of 1e-200",
-            estimate(lambda: operator().scaled(1e-200)),
+            estimate(lambda: 1e-200 * operator()),
             lambda s: abs(s.radius / 4e-200 - 1) < 0.02,
         ),
-        ("all weights zero", estimate(lambda: operator().scaled(0.0)), lambda s: s == (0, 0, 0)),
+        ("all weights zero", estimate(lambda: 0.0 * operator()), lambda s: s == (0, 0, 0)),
         ("one point", estimate(lambda: operator(1)), lambda s: s == (0, 0, 0)),
     )
 ]

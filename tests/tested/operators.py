@@ -174,6 +174,30 @@ TESTED = {
         "float32": _FORMS + "test_single_precision",
         "bad input": "malformed",
     },
+    "Sum": {
+        "value": "test_algebra.py::test_operators_are_added_and_multiplied_as_matrices",
+        "gradient": {"field": "test_algebra.py::test_derivatives_in_factors_and_terms"},
+        "jit": "test_algebra.py::test_operators_are_added_and_multiplied_as_matrices",
+        "vmap": "test_algebra.py::test_derivatives_in_factors_and_terms",
+        "float32": "test_algebra.py::test_numbers_leave_the_precision_of_a_field",
+        "bad input": "malformed",
+    },
+    "Diagonal": {
+        "value": "test_algebra.py::test_operators_are_added_and_multiplied_as_matrices",
+        "gradient": {"field": "test_algebra.py::test_derivatives_in_factors_and_terms"},
+        "jit": "test_algebra.py::test_operators_are_added_and_multiplied_as_matrices",
+        "vmap": "test_algebra.py::test_derivatives_in_factors_and_terms",
+        "float32": "test_algebra.py::test_numbers_leave_the_precision_of_a_field",
+        "bad input": "malformed",
+    },
+    "identity": {
+        "value": "test_algebra.py::test_operators_are_added_and_multiplied_as_matrices",
+        "gradient": {"field": "test_algebra.py::test_derivatives_in_factors_and_terms"},
+        "jit": "test_algebra.py::test_operators_are_added_and_multiplied_as_matrices",
+        "vmap": "test_algebra.py::test_derivatives_in_factors_and_terms",
+        "float32": "test_algebra.py::test_numbers_leave_the_precision_of_a_field",
+        "bad input": "malformed",
+    },
     "DCPSE": {
         "value": "test_accuracy.py::test_convergence_on_the_sphere, "
         "test_forms.py::test_every_polynomial_of_the_surface_basis_is_exact, " + _HIGH,

@@ -6,9 +6,11 @@ about as wide, as the operators of different surfaces of as many points are.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator
+import weakref
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,8 +20,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float, Int
 
-from ..arguments import is_concrete
-from ..stencils.stencil import AbstractOperator, Composition, Stencil
+from .gathers import constant_product, product, take
 
 # An entry added by a scatter costs about as much as this many padded slots.
 _SCATTER = 12
@@ -27,8 +28,6 @@ _SCATTER = 12
 _LISTED = 1 / 8
 # Widths tried for a matrix of known usual width: that times powers of this, if not told otherwise.
 _STEP = 0.7
-# Below this many entries everything is gathered at once, without a loop over slots.
-_SMALL = 50_000
 
 
 class Table(NamedTuple):
@@ -123,18 +122,16 @@ def _widths(width: float | None, step: float) -> Iterator[int]:
 
 
 class PaddedMatrix(eqx.Module):
-    """A sparse, possibly rectangular matrix that is applied with one gather per slot.
+    """A sparse, possibly rectangular matrix of scalars that is applied with one gather per slot.
 
     Args:
         indices: columns, `(k, m)`.
         weights: entries, `(k, m)`; zero in padded slots.
-        diagonal: added to the diagonal, `(m,)`; None for zero.
         extra: rows, columns and values of entries that did not fit; zeros fill the list up.
     """
 
     indices: Int[Array, "k m"]
     weights: Float[Array, "k m"]
-    diagonal: Float[Array, " m"] | None
     extra: tuple[Int[Array, " e"], Int[Array, " e"], Float[Array, " e"]]
 
     @classmethod
@@ -145,118 +142,96 @@ class PaddedMatrix(eqx.Module):
         table = tabulate(matrix.indptr, matrix.indices, rows=rows, width=width, step=step)
         values = np.append(matrix.data.astype(dtype), np.zeros(1, dtype))
         extra = (table.rows, table.others, values[table.sources])
-        return cls(*jax.device_put((table.columns, values[table.source], None, extra)))
+        return cls(*jax.device_put((table.columns, values[table.source], extra)))
 
     def minus(self, factor, other: PaddedMatrix) -> PaddedMatrix:
         """This matrix less a number times another of the same layout."""
         weights = self.weights - factor * other.weights
         extra = self.extra[2] - factor * other.extra[2]
-        return PaddedMatrix(self.indices, weights, None, (*self.extra[:2], extra))
+        return PaddedMatrix(self.indices, weights, (*self.extra[:2], extra))
 
     def __call__(self, x: Float[Array, " p"]) -> Float[Array, " m"]:
-        k, m = self.indices.shape
-        take = lambda j: x.at[j].get(mode="promise_in_bounds")
-        zero = jnp.zeros(m, jnp.result_type(x, self.weights))
-        start = zero if self.diagonal is None else self.diagonal * x
-        if k * m < _SMALL:
-            total = start + jnp.sum(self.weights * take(self.indices), axis=0)
-        else:
-            add = lambda total, slot: (total + slot[0] * take(slot[1]), None)
-            total = jax.lax.scan(add, start, (self.weights, self.indices))[0]
         rows, columns, values = self.extra
-        return total.at[rows].add(values * take(columns))
+        total = constant_product(self.weights, self.indices, x)
+        return total.at[rows].add(values * take(x, columns))
 
 
 class Incoming(eqx.Module):
-    """Which entries of a stencil refer to each point: its transpose without a scatter.
+    """A transposed stencil: its entries by the point they read, components exchanged.
 
     Args:
-        indices: of the stencil that the layout belongs to, `(k, n)`.
-        table: entries by the point they read; those on the diagonal left out.
+        indices, weights: as of a stencil, `(k, n)` and `(k, *in_shape, *out_shape, n)`.
+        extra: rows, columns and weights of entries that did not fit.
+        contracted: number of components axes that are summed over.
     """
 
     indices: Int[Array, "k n"]
-    table: Table
+    weights: Float[Array, "k *c n"]
+    extra: tuple[Int[Array, " e"], Int[Array, " e"], Float[Array, "*c e"]]
+    contracted: int = eqx.field(static=True)
 
     @classmethod
-    def of(cls, stencil: Stencil) -> Incoming | None:
-        """The layout of a scalar stencil with concrete indices; None of one with components."""
-        if stencil.in_shape or stencil.out_shape:
-            return None
-        k, n = stencil.indices.shape
-        target = np.ascontiguousarray(np.asarray(stencil.indices).T, dtype=np.int32)
-        number = np.arange(n, dtype=np.int32)[:, None] + np.arange(k, dtype=np.int32) * np.int32(n)
-        # Padded slots refer to their own row: left in, they would make long rows.
-        other = target != np.arange(n, dtype=np.int32)[:, None]
-        indptr = np.append(0, np.cumsum(other.sum(axis=1)))
-        matrix = scipy.sparse.csr_matrix((number[other], target[other], indptr), shape=(n, n))
-        turned = matrix.tocsc()
-        # A point is read about as often as it reads.
-        table = tabulate(turned.indptr, turned.indices, turned.data, width=1.15 * k)
-        return cls(stencil.indices, jax.device_put(table))
+    def of(cls, stencil, table: Table) -> Incoming:
+        """The weights of a stencil gathered once, in the order of a table made for its indices."""
+        contracted = len(stencil.out_shape)
+        gathered = functools.partial(_gathered, stencil.weights, contracted)
+        weights = gathered(table.source)
+        # The first slot of the table is kept for what a row adds to its own point.
+        diagonal = _exchanged(stencil.diagonal, contracted, 0)
+        weights = weights.at[0].set(diagonal)
+        extra = (table.rows, table.others, gathered(table.sources))
+        return cls(table.columns, weights, extra, contracted)
 
-    def belongs_to(self, stencil: Stencil) -> bool:
-        """Whether it was made for these indices; concrete."""
-        mine, others = self.indices, stencil.indices
-        return mine is others or np.array_equal(np.asarray(mine), np.asarray(others))
-
-    def transpose(self, stencil: Stencil) -> PaddedMatrix:
-        """The transposed stencil, with its weights gathered once.
-
-        The stencil must have the indices that the layout was made for.
-        """
-        weights = stencil.weights
-        if stencil.indices is not self.indices:
-            weights = eqx.error_if(
-                weights,
-                jnp.any(stencil.indices != self.indices),
-                "the preconditioner was made for other neighbours than the operator has: make it "
-                "for this operator",
-            )
-        values = weights.reshape(-1)
-        fill = lambda place: values.at[place].get(mode="fill", fill_value=0)
-        table = self.table
-        extra = (table.rows, table.others, fill(table.sources))
-        return PaddedMatrix(table.columns, fill(table.source), stencil.diagonal, extra)
+    def __call__(self, v: Float[Array, "n *c"]) -> Float[Array, "n *d"]:
+        return product(self.weights, self.indices, v, self.contracted, self.extra)
 
 
-# Of a stencil; of the factors of a composition; None where it is not known.
-Layout = Incoming | tuple | None
+@functools.partial(jax.jit, static_argnums=1)
+def _gathered(weights, contracted: int, place):
+    """Entries of `(k, *c, n)` weights by their number slot * n + row, zero past the end."""
+    components = weights.shape[1:-1]
+    flat = jnp.moveaxis(weights, -1, 1).reshape(-1, *components)
+    found = flat.at[place].get(mode="fill", fill_value=0)
+    return _exchanged(jnp.moveaxis(found, place.ndim - 1, -1), contracted, place.ndim - 1)
 
 
-def incoming_layout(operator: AbstractOperator) -> Layout:
-    """The layout of the transpose of an operator with concrete indices."""
-    if isinstance(operator, Composition):
-        return incoming_layout(operator.outer), incoming_layout(operator.inner)
-    return Incoming.of(operator) if isinstance(operator, Stencil) else None
+def _exchanged(weights, contracted: int, start: int):
+    """Components given, the first of those from axis `start` on, put behind those taken."""
+    if not 0 < contracted < weights.ndim - start - 1:
+        return weights
+    given = range(start, start + contracted)
+    return jnp.moveaxis(weights, tuple(given), tuple(range(-1 - contracted, -1)))
 
 
-def matching_layout(layout: Layout, operator: AbstractOperator) -> Layout:
-    """The layout if it is one of this operator, as far as can be seen; else a new one."""
-    if isinstance(operator, Composition) and isinstance(layout, tuple):
-        return matching_layout(layout[0], operator.outer), matching_layout(
-            layout[1], operator.inner
-        )
-    if isinstance(operator, Stencil) and is_concrete(operator.indices):
-        if not isinstance(layout, Incoming) or not layout.belongs_to(operator):
-            return Incoming.of(operator)
-    return layout
+def table_of(indices: Int[Array, "k n"]) -> Table:
+    """Where the entries of the transpose of a stencil with these indices stand; kept for them."""
+    key = id(indices)
+    known = _tables.get(key)
+    if known is None or known[0]() is not indices:
+        with jax.ensure_compile_time_eval():  # kept, so that it must be no part of a trace
+            table = jax.device_put(_table(np.asarray(indices)))
+        known = weakref.ref(indices, lambda _: _tables.pop(key, None)), table
+        _tables[key] = known
+    return known[1]
 
 
-def adjoint(operator: AbstractOperator, layout: Layout) -> Callable | None:
-    """The transposed operator by gathers; None where a layout is lacking."""
-    if isinstance(operator, Composition) and isinstance(layout, tuple):
-        outer, inner = adjoint(operator.outer, layout[0]), adjoint(operator.inner, layout[1])
-        return None if outer is None or inner is None else _Chain(outer, inner)
-    if isinstance(operator, Stencil) and isinstance(layout, Incoming):
-        if operator.indices.shape == layout.indices.shape:
-            return layout.transpose(operator)
-    return None
+# By the identity of the indices, for as long as these live.
+_tables: dict[int, tuple[weakref.ref, Table]] = {}
 
 
-class _Chain(eqx.Module):
-    first: Callable
-    second: Callable
-
-    def __call__(self, v):
-        return self.second(self.first(v))
+def _table(indices: np.ndarray) -> Table:
+    k, n = indices.shape
+    target = np.ascontiguousarray(indices.T, dtype=np.int32)
+    number = np.arange(n, dtype=np.int32)[:, None] + np.arange(k, dtype=np.int32) * np.int32(n)
+    # Padded slots refer to their own row: left in, they would make long rows.
+    other = target != np.arange(n, dtype=np.int32)[:, None]
+    indptr = np.append(0, np.cumsum(other.sum(axis=1)))
+    matrix = scipy.sparse.csr_matrix((number[other], target[other], indptr), shape=(n, n))
+    turned = matrix.tocsc()
+    # A point is read about as often as it reads.
+    table = tabulate(turned.indptr, turned.indices, turned.data, width=1.15 * k)
+    own, none = np.arange(n, dtype=np.int32), np.full(n, np.iinfo(np.int32).max, np.int32)
+    return table._replace(
+        columns=np.concatenate([own[None], table.columns]),
+        source=np.concatenate([none[None], table.source]),
+    )

@@ -1,0 +1,434 @@
+"""Linear operators on fields, and what can be made of them: sums, products, transposes."""
+
+from __future__ import annotations
+
+import abc
+import functools
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import scipy.sparse
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from ..arguments import as_float, instance, is_concrete, whole
+from .lineax import Action
+
+
+class AbstractOperator(eqx.Module):
+    """A linear map from fields `(n, *batch, *in_shape)` to fields `(n, *batch, *out_shape)`.
+
+    Operators add, subtract and multiply: `L + M`, `2 * L`, `-L + 1`, `f * L` (row i times `f[i]`),
+    `L + f` (plus `f[i]` times the value at point i), `L @ M`, `L @ u` and `L.T`.
+
+    Example:
+        >>> laplacian = js.laplace_beltrami(js.sphere(300))
+        >>> screened = -laplacian + 1
+        >>> u = jnp.arange(300.0)
+        >>> bool(jnp.allclose(screened @ u, u - laplacian(u)))
+        True
+        >>> twice = laplacian @ laplacian
+        >>> [isinstance(operator, js.AbstractOperator) for operator in (laplacian, twice)]
+        [True, True]
+    """
+
+    # NumPy's arrays leave products with operators to these.
+    __array_ufunc__ = None
+
+    @property
+    @abc.abstractmethod
+    def n(self) -> int:
+        """Number of points."""
+
+    @property
+    @abc.abstractmethod
+    def in_shape(self) -> tuple[int, ...]:
+        """Components per point that the operator takes: `()` for scalar fields."""
+
+    @property
+    @abc.abstractmethod
+    def out_shape(self) -> tuple[int, ...]:
+        """Components per point that the operator gives."""
+
+    @abc.abstractmethod
+    def __call__(self, u: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
+        """Apply to a field or to a batch of fields."""
+
+    def transpose(self) -> AbstractOperator:
+        """The transposed operator, with the components taken and given exchanged."""
+        return Transposed(self)
+
+    @property
+    def T(self) -> AbstractOperator:
+        """The transposed operator."""
+        return self.transpose()
+
+    @property
+    def border(self) -> Bool[Array, " n"] | None:
+        """True at border points of the surface, which conditions should say something about.
+
+        None on closed surfaces, and where it is not known.
+        """
+        return None
+
+    @property
+    def diagonal(self) -> Float[Array, "*c n"]:
+        """The weight of every point in its own row, `(*out_shape, *in_shape, n)`.
+
+        Raises:
+            ValueError: an operator of which it is not known.
+        """
+        raise ValueError(f"the diagonal of a {type(self).__name__} is not at hand")
+
+    def to_scipy(self) -> scipy.sparse.csr_matrix:
+        """CSR matrix acting on flattened fields (the components of a point stand together).
+
+        Raises:
+            ValueError: an operator of which only products are known.
+        """
+        raise ValueError(f"the matrix of a {type(self).__name__} is not at hand")
+
+    def to_lineax(self, dtype=None) -> lx.AbstractLinearOperator:
+        """The operator on one field, for the linear solvers of lineax."""
+        return Action(self, jnp.dtype(jnp.result_type(float) if dtype is None else dtype))
+
+    def __matmul__(self, other):
+        return Composition(self, other) if isinstance(other, AbstractOperator) else self(other)
+
+    def __add__(self, other) -> AbstractOperator:
+        if not isinstance(other, AbstractOperator):
+            other = Diagonal(per_point(other, self.n, "term"), self.n, self.in_shape)
+        return Sum(self, other)
+
+    def __radd__(self, other) -> AbstractOperator:
+        return self + other
+
+    def __neg__(self) -> AbstractOperator:
+        return -1.0 * self
+
+    def __sub__(self, other) -> AbstractOperator:
+        return self + -(other if isinstance(other, AbstractOperator) else as_float(other, "term"))
+
+    def __rsub__(self, other) -> AbstractOperator:
+        return -self + other
+
+    def __rmul__(self, factor) -> AbstractOperator:
+        factor = per_point(factor, self.n, "factor")
+        return Composition(Diagonal(factor, self.n, self.out_shape), self)
+
+    def __mul__(self, factor) -> AbstractOperator:
+        if isinstance(factor, AbstractOperator):
+            raise TypeError("factor is an operator: write one @ other for one after the other")
+        factor = per_point(factor, self.n, "factor")
+        if factor.ndim:
+            raise ValueError(
+                f"factor has shape {factor.shape}, expected (): write factor * operator for a "
+                "number per row, or operator @ js.Diagonal(factor) for fields multiplied before"
+            )
+        return self.__rmul__(factor)
+
+    def __truediv__(self, number) -> AbstractOperator:
+        return self * (1 / as_float(number, "number"))
+
+    def checked(self, u: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
+        """A field that the operator takes, as an array; else an error."""
+        u = as_float(u, "field")
+        split = u.ndim - len(self.in_shape)
+        if split < 1 or u.shape[0] != self.n or u.shape[split:] != self.in_shape:
+            batch = "".join(f", {c}" for c in self.in_shape)
+            raise ValueError(
+                f"field has shape {u.shape}, expected ({self.n}{batch or ','}) or a batch "
+                f"({self.n}, c{batch})"
+            )
+        return u
+
+    @property
+    def _maps(self) -> str:
+        """What goes in and comes out, for `repr`."""
+        kinds = [
+            {0: "scalar", 1: "vector"}.get(len(s), "tensor")
+            for s in (self.in_shape, self.out_shape)
+        ]
+        return f"{self.n:,} points, {kinds[0]} to {kinds[1]} fields"
+
+
+class Diagonal(AbstractOperator):
+    """Multiplication by a number or by a scalar field: all components of a point by one number.
+
+    Args:
+        factor: a number, or one per point `(n,)`.
+        n: number of points; that of the factors if None.
+        shape: components per point of the fields, `()` for scalar ones.
+
+    Raises:
+        TypeError: no real numbers.
+        ValueError: a factor of another shape; a number without n.
+
+    Example:
+        >>> factor = jnp.arange(3.0)
+        >>> (js.Diagonal(factor) @ jnp.ones(3)).tolist()
+        [0.0, 1.0, 2.0]
+        >>> (2.0 - js.Diagonal(factor)).to_scipy().diagonal().tolist()
+        [2.0, 1.0, 0.0]
+    """
+
+    factor: Float[Array, "*n"]
+    n: int = eqx.field(static=True, default=0)
+    in_shape: tuple[int, ...] = eqx.field(static=True, default=())
+
+    def __init__(self, factor: ArrayLike, n: int | None = None, shape: tuple[int, ...] = ()):
+        factor = as_float(factor, "factor")
+        if n is None and factor.ndim != 1:
+            raise ValueError(f"factor has shape {factor.shape}, expected (n,), or n is needed")
+        self.n = whole(len(factor) if n is None else n, "n", least=1)
+        self.in_shape = shape
+        self.factor = per_point(factor, self.n, "factor")
+
+    def __repr__(self):
+        return f"Diagonal({self._maps})"
+
+    @property
+    def out_shape(self):
+        return self.in_shape
+
+    @property
+    def diagonal(self):
+        if self.in_shape:
+            return super().diagonal
+        return jnp.broadcast_to(self.factor, self.n)
+
+    def __call__(self, u):
+        u = self.checked(u)
+        if not self.factor.ndim:  # numbers leave the precision of a field
+            return self.factor.astype(u.dtype) * u
+        return self.factor.reshape(-1, *[1] * (u.ndim - 1)) * u
+
+    def transpose(self):
+        return self
+
+    def to_scipy(self):
+        factor = np.broadcast_to(np.asarray(self.factor), self.n)
+        return scipy.sparse.diags(np.repeat(factor, math.prod(self.in_shape))).tocsr()
+
+
+def identity(n: int, shape: tuple[int, ...] = ()) -> Diagonal:
+    """The operator that leaves fields as they are.
+
+    Args:
+        n: number of points.
+        shape: components per point of the fields.
+
+    Example:
+        >>> u = jnp.arange(4.0)
+        >>> bool(jnp.all((3 * js.identity(4)) @ u == 3 * u))
+        True
+    """
+    return Diagonal(1.0, n, shape)
+
+
+class Composition(AbstractOperator):
+    """One operator after another: `(outer @ inner)(u) = outer(inner(u))`.
+
+    Example:
+        >>> cloud = js.sphere(300)
+        >>> laplacian = js.laplace_beltrami(cloud)
+        >>> z = cloud.points[:, 2]
+        >>> bool(jnp.all((laplacian @ laplacian)(z) == laplacian(laplacian(z))))
+        True
+    """
+
+    outer: AbstractOperator
+    inner: AbstractOperator
+
+    def __check_init__(self):
+        for name in ("outer", "inner"):
+            instance(getattr(self, name), AbstractOperator, name)
+        have = (self.inner.n, self.inner.out_shape)
+        want = (self.outer.n, self.outer.in_shape)
+        if have != want:
+            raise ValueError(f"inner operator gives (n, components) {have}, outer takes {want}")
+
+    @property
+    def n(self):
+        return self.inner.n
+
+    @property
+    def in_shape(self):
+        return self.inner.in_shape
+
+    @property
+    def out_shape(self):
+        return self.outer.out_shape
+
+    @property
+    def border(self):
+        return either(self.inner.border, self.outer.border)
+
+    @property
+    def diagonal(self):
+        if isinstance(self.outer, Diagonal):
+            return self.outer.factor * self.inner.diagonal
+        return super().diagonal
+
+    def __repr__(self):
+        return f"Composition({self._maps}, of {self.outer!r} after {self.inner!r})"
+
+    def __call__(self, u):
+        return self.outer(self.inner(u))
+
+    def transpose(self):
+        return Composition(self.inner.T, self.outer.T)
+
+    def to_scipy(self):
+        return (self.outer.to_scipy() @ self.inner.to_scipy()).tocsr()
+
+
+class Sum(AbstractOperator):
+    """Two operators added: `(one + other)(u) = one(u) + other(u)`.
+
+    Example:
+        >>> laplacian = js.laplace_beltrami(js.sphere(300))
+        >>> hyper = laplacian - 0.1 * laplacian @ laplacian
+        >>> type(hyper).__name__, hyper.n
+        ('Sum', 300)
+    """
+
+    one: AbstractOperator
+    other: AbstractOperator
+
+    def __check_init__(self):
+        for name in ("one", "other"):
+            instance(getattr(self, name), AbstractOperator, name)
+        maps = [(o.n, o.in_shape, o.out_shape) for o in (self.one, self.other)]
+        if maps[0] != maps[1]:
+            raise ValueError(
+                "operators of (n, components taken, components given) "
+                f"{maps[0]} and {maps[1]} cannot be added"
+            )
+
+    @property
+    def n(self):
+        return self.one.n
+
+    @property
+    def in_shape(self):
+        return self.one.in_shape
+
+    @property
+    def out_shape(self):
+        return self.one.out_shape
+
+    @property
+    def border(self):
+        return either(self.one.border, self.other.border)
+
+    @property
+    def diagonal(self):
+        return self.one.diagonal + self.other.diagonal
+
+    def __repr__(self):
+        return f"Sum({self._maps}, of {self.one!r} and {self.other!r})"
+
+    def __call__(self, u):
+        return self.one(u) + self.other(u)
+
+    def transpose(self):
+        return Sum(self.one.T, self.other.T)
+
+    def to_scipy(self):
+        return (self.one.to_scipy() + self.other.to_scipy()).tocsr()
+
+
+class Transposed(AbstractOperator):
+    """The transpose of an operator of which products are known.
+
+    Args:
+        operator: what is transposed.
+        rows: the transpose as a function, where there is one that reads instead of scattering.
+    """
+
+    operator: AbstractOperator
+    rows: Callable | None = None
+
+    @property
+    def n(self):
+        return self.operator.n
+
+    @property
+    def in_shape(self):
+        return self.operator.out_shape
+
+    @property
+    def out_shape(self):
+        return self.operator.in_shape
+
+    @property
+    def border(self):
+        return self.operator.border
+
+    @property
+    def diagonal(self):
+        if self.in_shape or self.out_shape:
+            return super().diagonal
+        return self.operator.diagonal
+
+    def __repr__(self):
+        return f"Transposed({self._maps}, of {self.operator!r})"
+
+    def __call__(self, v):
+        v = self.checked(v)
+        if self.rows is not None:
+            return self.rows(v)
+        batch = v.shape[: v.ndim - len(self.in_shape)]
+        u = jax.ShapeDtypeStruct((*batch, *self.out_shape), v.dtype)
+        out = jax.eval_shape(self.operator, u)
+        return jax.linear_transpose(self.operator, u)(v.astype(out.dtype))[0]
+
+    def transpose(self):
+        return self.operator
+
+    def to_scipy(self):
+        return self.operator.to_scipy().T.tocsr()
+
+
+class Map(AbstractOperator):
+    """A linear map of scalar fields given as a function, of which only products are known.
+
+    Args:
+        function: takes and gives a field.
+        n: number of points.
+    """
+
+    function: Callable
+    n: int = eqx.field(static=True, default=0)
+    in_shape = ()
+    out_shape = ()
+
+    def __call__(self, u):
+        return self.function(u)
+
+
+def check_scalar(operator: AbstractOperator) -> None:
+    """Refuse operators with components."""
+    if operator.in_shape or operator.out_shape:
+        shapes = f"{operator.in_shape} to {operator.out_shape}"
+        raise ValueError(f"an operator on scalar fields is needed, not from {shapes} components")
+
+
+def per_point(value: ArrayLike, n: int, name: str) -> Float[Array, "*n"]:
+    """A number or one number per point, as an array; else an error."""
+    value = as_float(value, name)
+    if value.shape not in ((), (n,)):
+        raise ValueError(f"{name} has shape {value.shape}, expected () or ({n},)")
+    return value
+
+
+def either(*borders):
+    """True where one of several masks is, of which each may be None."""
+    marked = [b for b in borders if b is not None]
+    both = (np if is_concrete(*marked) else jnp).logical_or
+    return functools.reduce(both, marked) if marked else None

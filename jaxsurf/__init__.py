@@ -26,9 +26,6 @@ from .curvature import principal_curvatures as principal_curvatures
 from .curvature import shape_tensor as shape_tensor
 from .discretization import Discretization as Discretization
 from .discretization import discretize as discretize
-from .frames import estimate_normals as estimate_normals
-from .frames import from_points as from_points
-from .frames import refit_normals as refit_normals
 from .frames import tangent_frames as tangent_frames
 from .ghosts import with_ghosts as with_ghosts
 from .io import read as read
@@ -37,6 +34,9 @@ from .io import write as write
 from .neighbors import Neighbors as Neighbors
 from .neighbors import find_neighbors as find_neighbors
 from .neighbors import tube_ratio as tube_ratio
+from .normals import estimate_normals as estimate_normals
+from .normals import from_points as from_points
+from .normals import refit_normals as refit_normals
 from .operators import biharmonic as biharmonic
 from .operators import diffusion as diffusion
 from .operators import directional_derivative as directional_derivative

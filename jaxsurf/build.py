@@ -13,10 +13,10 @@ from .arguments import instance, is_concrete
 from .arguments import mask as checked_mask
 from .cloud import PointCloud
 from .compiling import copying_jit, namespace, sized_jit
+from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .neighbors import Neighbors, Rows, find_neighbors, nearest_of
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood
-from .stencils.moments import blockwise, in_blocks, out_of_blocks
 from .stencils.stencil import Stencil
 from .stencils.targets import Laplacian
 

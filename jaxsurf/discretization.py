@@ -16,13 +16,13 @@ from .borders import Border, find_border
 from .build import build, choose_neighbors, residual_tolerance
 from .cloud import PointCloud
 from .compiling import copying_jit
+from .fits.monomials import polynomial_count
 from .interpolation import interpolation_weights, nearest_points
 from .motion import CODES, carried, judged
 from .neighbors import Neighbors
 from .quadrature import cell_weights
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod
-from .stencils.monomials import polynomial_count
 from .stencils.stencil import Composition, Stencil
 from .stencils.targets import Gradient, Joint, Laplacian
 

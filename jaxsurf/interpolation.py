@@ -12,11 +12,11 @@ from .arguments import is_concrete
 from .build import blocks_of, neighborhood, rows_of
 from .cloud import PointCloud
 from .compiling import sized_jit
+from .fits.moments import blockwise, in_blocks, moment_solve
+from .fits.monomials import monomials
+from .fits.plane import TangentPlane
 from .neighbors import Neighbors, Rows
 from .stencils.method import with_center
-from .stencils.moments import blockwise, in_blocks, moment_solve
-from .stencils.monomials import monomials
-from .stencils.plane import TangentPlane
 
 _BATCH = 128
 

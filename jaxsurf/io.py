@@ -16,7 +16,7 @@ from jaxtyping import Array, Shaped
 from jaxsurf.arguments import in_range, instance, is_concrete, raise_at, real, whole
 from jaxsurf.cloud import PointCloud
 from jaxsurf.formats import Contents, contents_of, meshio
-from jaxsurf.frames import estimate_normals
+from jaxsurf.normals import estimate_normals
 from jaxsurf.shapes.closest import fit_surface
 from jaxsurf.shapes.meshes import TriangleMesh, clean_mesh, merge_equal, sample_mesh
 

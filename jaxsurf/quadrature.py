@@ -5,7 +5,7 @@ plane of its point a cell is a polygon, whose sides are slightly curved; with th
 over that plane, fitted to the neighbours, the moments of the cell are found by Gauss's rule.
 A function is integrated over a cell as its local polynomial is: from these moments come weights of
 all neighbours, exactly as those of a derivative come from its values on monomials
-(`stencils/moments.py`). Their sums over all cells integrate over the surface.
+(`fits/moments.py`). Their sums over all cells integrate over the surface.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from jaxtyping import Array, Bool, Float
 from .build import blocks_of, neighborhood, rows_of
 from .cloud import PointCloud
 from .compiling import sized_jit
+from .fits.moments import blockwise, in_blocks, moment_solve
+from .fits.monomials import differentiation, monomials_by_degree, polynomial_count
+from .fits.plane import TangentPlane
 from .neighbors import Neighbors
 from .stencils.method import with_center
-from .stencils.moments import blockwise, in_blocks, moment_solve
-from .stencils.monomials import differentiation, monomials_by_degree, polynomial_count
-from .stencils.plane import TangentPlane
 
 _BATCH = 128
 # Newton steps from cells with straight sides to those on the surface: each squares what is left of

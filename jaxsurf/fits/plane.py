@@ -4,12 +4,34 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..frames import tangent_frames
-from .kernels import gaussian
-from .method import Neighborhood, dot
+from .kernels import gaussian, support
 from .moments import polynomial_fit
+
+
+class Neighborhood(eqx.Module):
+    """What the stencils of a block of points see: offsets and normals of the neighbours.
+
+    The centre comes first. The last axis, `*p`, is the points of the block; without it, all
+    that is made of a neighbourhood is for a single point.
+    """
+
+    offsets: Float[Array, "k d *p"]
+    normals: Float[Array, "k d *p"]
+    mask: Bool[Array, "k *p"]
+    radius: Float[Array, "*p"] | None
+
+    def support(self, dim: int, given: float | None) -> Float[Array, "*p"]:
+        """Support radius of a method: the given one, that of the search, or a length filled."""
+        radius = self.radius if given is None else given
+        return support(self.squared, self.mask, dim=dim, radius=radius)
+
+    @property
+    def squared(self) -> Float[Array, "k *p"]:
+        """Squared distances from the centre."""
+        return dot(self.offsets, self.offsets)
 
 
 class TangentPlane(eqx.Module):
@@ -51,3 +73,8 @@ class TangentPlane(eqx.Module):
 
 def _width(degree: int) -> float:
     return 0.36 if degree <= 2 else 0.315
+
+
+def dot(a: Float[Array, "k d *p"], b: Float[Array, "#k d *p"]) -> Float[Array, "k *p"]:
+    """Scalar products; written out, as sums over an axis between others are slow."""
+    return sum((a[:, i] * b[:, i] for i in range(1, a.shape[1])), a[:, 0] * b[:, 0])

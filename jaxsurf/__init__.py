@@ -24,6 +24,7 @@ from .curvature import mean_curvature as mean_curvature
 from .curvature import mean_curvature_vector as mean_curvature_vector
 from .curvature import principal_curvatures as principal_curvatures
 from .curvature import shape_tensor as shape_tensor
+from .curvature import tube_ratio as tube_ratio
 from .discretization import Discretization as Discretization
 from .discretization import discretize as discretize
 from .frames import tangent_frames as tangent_frames
@@ -33,7 +34,6 @@ from .io import read_fields as read_fields
 from .io import write as write
 from .neighbors import Neighbors as Neighbors
 from .neighbors import find_neighbors as find_neighbors
-from .neighbors import tube_ratio as tube_ratio
 from .normals import estimate_normals as estimate_normals
 from .normals import from_points as from_points
 from .normals import refit_normals as refit_normals

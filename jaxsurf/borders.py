@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from .arguments import instance, is_concrete, raise_at, real, whole
 from .cloud import PointCloud
 from .frames import tangent_frames
-from .neighbors import distance_key, nearest
+from .nearest import distance_key, nearest
 from .shapes.meshes import TriangleMesh
 
 # Points in a row that the border is interpolated through.

@@ -13,9 +13,11 @@ from jaxtyping import Array, Bool, Float
 from scipy.spatial import cKDTree
 
 from .arguments import as_float, in_range, instance, is_concrete, mask, raise_at, whole
+from .checks import check_count, check_spacing
 from .cloud import PointCloud
 from .frames import frames_of
-from .neighbors import Neighbors, check_count, check_spacing, nearest
+from .nearest import nearest
+from .neighbors import Neighbors
 from .orient import check_one_sided, orient_normals, plane_normals
 
 # Below this smallest pivot of the scaled normal equations, times the round-off, a fit is noise.

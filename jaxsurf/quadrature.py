@@ -20,7 +20,8 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Bool, Float
 
-from .build import blocks_of, neighborhood, rows_of
+from .arguments import is_concrete, refuse
+from .build import blocks_of, determined, neighborhood, rows_of
 from .cloud import PointCloud
 from .compiling import sized_jit
 from .fits.moments import blockwise, in_blocks, moment_solve
@@ -33,6 +34,32 @@ _BATCH = 128
 # Newton steps from cells with straight sides to those on the surface: each squares what is left of
 # an error of the size (spacing x curvature)^2.
 _STEPS = 2
+# So many neighbours may bound a cell; where points are very uneven, all are tried.
+_CELLS = 24
+
+
+def areas(
+    cloud: PointCloud,
+    neighbors: Neighbors,
+    degree: int,
+    outward: Float[Array, "n d"] | None,
+) -> Float[Array, " n"]:
+    """Weights of the points in integrals over the surface; arguments as of `cell_weights`."""
+    args = (cloud, neighbors, degree)
+    weights, closed, residual = cell_weights(*args, _CELLS, outward)
+    if is_concrete(closed) and not closed.all():
+        weights, closed, residual = cell_weights(*args, neighbors.k, outward)
+    text = (
+        "the neighbours of point {i} do not close its cell, out of {v} of them: mark the "
+        "border of the surface (`boundary`), or choose more neighbours"
+    )
+    weights = refuse(weights, ~closed, text, jnp.sum(neighbors.mask, axis=1))
+    return _summed(determined(weights, residual, degree), neighbors.indices.T)
+
+
+@jax.jit
+def _summed(weights, indices):
+    return jnp.zeros(weights.shape[1], weights.dtype).at[indices].add(weights)
 
 
 def cell_weights(

@@ -3,10 +3,10 @@
 Points, then neighbours, then stencils, then operators: `import jaxsurf as js`.
 """
 
-from .borders import Border as Border
-from .borders import border_conormals as border_conormals
-from .borders import detect_border as detect_border
-from .borders import find_border as find_border
+from .borders.border import Border as Border
+from .borders.detect import detect_border as detect_border
+from .borders.order import border_conormals as border_conormals
+from .borders.order import find_border as find_border
 from .boundary import Closure as Closure
 from .boundary import close as close
 from .build import choose_neighbors as choose_neighbors

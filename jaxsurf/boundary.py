@@ -24,7 +24,8 @@ import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int, Real
 
 from .arguments import as_float, instance, is_concrete, raise_at, real, whole
-from .borders import Border, checked_border, find_border, inward
+from .borders.border import Border, checked_border
+from .borders.order import find_border, inward
 from .build import residual_tolerance, stencil_weights
 from .cloud import PointCloud
 from .conditions import Condition, checked_conditions

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float, Int
 
 from . import curvature, operators, quadrature
 from .arguments import as_float, finite, instance, is_concrete, raise_at
-from .borders import Border, find_border
+from .borders.border import Border
+from .borders.order import find_border
 from .build import build, choose_neighbors
 from .cloud import PointCloud
 from .compiling import copying_jit

@@ -25,7 +25,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from .arguments import instance, is_concrete, real
-from .borders import Border, checked_border, find_border
+from .borders.border import Border, checked_border
+from .borders.order import find_border
 from .boundary import Closure, Source, check_pivots
 from .cloud import PointCloud
 from .conditions import Condition, checked_conditions

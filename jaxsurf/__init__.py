@@ -8,7 +8,6 @@ from .borders.detect import detect_border as detect_border
 from .borders.order import border_conormals as border_conormals
 from .borders.order import find_border as find_border
 from .boundary import Closure as Closure
-from .boundary import close as close
 from .build import choose_neighbors as choose_neighbors
 from .cells import SearchCapacity as SearchCapacity
 from .cells import allocate as allocate
@@ -37,6 +36,7 @@ from .neighbors import find_neighbors as find_neighbors
 from .normals import estimate_normals as estimate_normals
 from .normals import from_points as from_points
 from .normals import refit_normals as refit_normals
+from .onesided import close as close
 from .operators import biharmonic as biharmonic
 from .operators import diffusion as diffusion
 from .operators import directional_derivative as directional_derivative

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .boundary import Closure, close
+from .boundary import Closure
 from .cloud import PointCloud
 from .conditions import dirichlet
 from .curvature import shape_tensor
@@ -30,6 +30,7 @@ from .formats import contents_of
 from .frames import tangent_frames
 from .io import read, write
 from .neighbors import Neighbors
+from .onesided import close
 from .operators import laplace_beltrami
 from .plot import plot_fields
 from .shapes.implicit import double_torus, level_set, level_set_normals, project_to_level_set

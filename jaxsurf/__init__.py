@@ -62,7 +62,7 @@ from .shapes.meshes import clean_mesh as clean_mesh
 from .shapes.meshes import sample_mesh as sample_mesh
 from .shapes.order import sort_cloud as sort_cloud
 from .shapes.sampling import jitter as jitter
-from .shapes.sampling import poisson_disk as poisson_disk
+from .shapes.thinning import poisson_disk as poisson_disk
 from .solve.conserve import conservative_weights as conservative_weights
 from .solve.eigen import Eigenmodes as Eigenmodes
 from .solve.eigen import eigenmodes as eigenmodes

@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull, cKDTree
 from jaxsurf.io import read
 from jaxsurf.shapes.closest import ClosestPoint, fit_surface
 from jaxsurf.shapes.meshes import TriangleMesh, clean_mesh, sample_mesh
-from jaxsurf.shapes.sampling import measure_quality
+from jaxsurf.shapes.spacing import measure_quality
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
 

@@ -23,7 +23,7 @@ from jaxsurf.shapes.implicit import (
     level_set_normals,
     project_to_level_set,
 )
-from jaxsurf.shapes.sampling import ideal_spacing, measure_quality
+from jaxsurf.shapes.spacing import ideal_spacing, measure_quality
 
 from .helpers import check_derivative, count_compilations
 

@@ -14,9 +14,11 @@ from jaxtyping import Array, Float
 
 from jaxsurf.arguments import differentiable, in_range, is_concrete, on_host, raise_at, real, whole
 from jaxsurf.cloud import PointCloud
+from jaxsurf.compiling import block_by_block
 from jaxsurf.functions import Traced, canonical
 from jaxsurf.shapes.order import sort_points
-from jaxsurf.shapes.sampling import MOST, Project, ideal_spacing, in_blocks, relax
+from jaxsurf.shapes.sampling import Project, relax
+from jaxsurf.shapes.spacing import MOST, ideal_spacing
 
 # Successive angles at this distance never line up, whatever their number.
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
@@ -173,7 +175,7 @@ def surface_of_revolution(
     if not (isinstance(found, tuple | list) and [np.shape(a) for a in found] == [(), ()]):
         raise TypeError("profile must return two numbers, radius and z, for one number")
     program = canonical(profile, jnp.zeros((), dtype))
-    along = in_blocks(partial(_curve, program), dtype)
+    along = block_by_block(partial(_curve, program), dtype)
 
     table = np.linspace(start, stop, _TABLE)
     curve, tangent = (np.asarray(a, float) for a in along(table))
@@ -271,7 +273,7 @@ def graph(
     x = x0 + (x1 - x0) * within / (counts[row] - 1)
     y = y0 + (y1 - y0) * row / (len(counts) - 1)
     program = canonical(f, jnp.zeros((), dtype), jnp.zeros((), dtype))
-    heights = in_blocks(partial(_height, program), dtype)(np.stack([x, y], axis=1))
+    heights = block_by_block(partial(_height, program), dtype)(np.stack([x, y], axis=1))
     z, x_slope, y_slope = (np.asarray(a, float) for a in heights)
     bad = ~(np.isfinite(z) & np.isfinite(x_slope) & np.isfinite(y_slope))
     raise_at(bad, "f or its slope is not finite at (x, y) = {v}", np.stack([x, y], axis=1))

@@ -30,9 +30,11 @@ from jaxsurf.arguments import (
     whole,
 )
 from jaxsurf.cloud import PointCloud
+from jaxsurf.compiling import block_by_block
 from jaxsurf.functions import Traced, canonical
 from jaxsurf.shapes.order import sort_points
-from jaxsurf.shapes.sampling import MOST, in_blocks, points_at, quasi_uniform
+from jaxsurf.shapes.sampling import quasi_uniform
+from jaxsurf.shapes.spacing import MOST, points_at
 
 LevelSet = Callable[[Float[Array, " d"]], Float[Array, ""]]
 Bounds = tuple[tuple[float, ...], tuple[float, ...]]
@@ -97,7 +99,7 @@ def level_set(
         raise ValueError(f"n = {n} points, needs at least 4")
     dtype = jnp.result_type(float)
     program = _program(phi, jax.ShapeDtypeStruct((dim,), dtype))
-    look = in_blocks(partial(_values_and_gradients, program), dtype)
+    look = block_by_block(partial(_values_and_gradients, program), dtype)
 
     cells, size = _crossed_cells(look, box, resolution)
     if n is None:

@@ -18,7 +18,8 @@ from jaxsurf.arguments import in_range, instance, on_host, raise_at, real, whole
 from jaxsurf.cloud import PointCloud
 from jaxsurf.shapes.closest import ClosestPoint, fit_surface
 from jaxsurf.shapes.order import sort_cloud
-from jaxsurf.shapes.sampling import MOST, ideal_spacing, points_at, quasi_uniform
+from jaxsurf.shapes.sampling import quasi_uniform
+from jaxsurf.shapes.spacing import MOST, ideal_spacing, points_at
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Programs for the prompt: compiled quickly where that takes longer than running, or once for all."""
+"""Programs for the prompt: compiled quickly where that takes longer than running, or only once."""
 
 from __future__ import annotations
 

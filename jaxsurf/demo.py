@@ -33,7 +33,8 @@ from .neighbors import Neighbors
 from .onesided import close
 from .operators import laplace_beltrami
 from .plot import plot_fields
-from .shapes.implicit import double_torus, level_set, level_set_normals, project_to_level_set
+from .shapes.implicit import level_set_normals, project_to_level_set
+from .shapes.level_sets import double_torus, level_set
 from .spectrum import Spectrum, spectral_estimate
 from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil

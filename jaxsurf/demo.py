@@ -26,7 +26,7 @@ from .boundary import Closure
 from .cloud import PointCloud
 from .conditions import dirichlet
 from .curvature import shape_tensor
-from .formats import contents_of
+from .formats.by_suffix import contents_of
 from .frames import tangent_frames
 from .io import read, write
 from .neighbors import Neighbors

@@ -12,7 +12,7 @@ import pytest
 import jaxsurf as js
 from jaxsurf import demo
 from jaxsurf.cli import main
-from jaxsurf.formats import contents_of
+from jaxsurf.formats.by_suffix import contents_of
 
 _DATA = Path("../shared/data")
 

@@ -5,9 +5,8 @@ What `jaxsurf demo` computes, and the notebook after it; the command line only p
 
 from __future__ import annotations
 
-import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -36,6 +35,7 @@ from .plot import plot_fields
 from .shapes.implicit import level_set_normals, project_to_level_set
 from .shapes.level_sets import double_torus, level_set
 from .spectrum import Spectrum, spectral_estimate
+from .stages import noted, timed
 from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil
 from .time.explicit import RKC2
@@ -270,7 +270,7 @@ def run(
     @contextmanager
     def stage(name: str):
         tell(name)
-        with _timed() as spent, _noted(notes):
+        with timed() as spent, noted(notes):
             yield
         seconds[name] = spent()
 
@@ -411,40 +411,3 @@ def _probe(cloud: PointCloud, source: int, distance: float) -> int:
 
 def _rounded(value: float) -> float:
     return float(f"{value:.1g}")
-
-
-@contextmanager
-def _noted(notes: list[str]) -> Iterator[None]:
-    """Collect the package's warnings as notes for the report."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("ignore")
-        warnings.simplefilter("always", UserWarning)
-        yield
-    notes += [str(warning.message) for warning in caught]
-
-
-@contextmanager
-def _timed() -> Iterator[Callable[[], tuple[float, float]]]:
-    """Seconds spent compiling, and on everything else."""
-    spans: list[tuple[float, float]] = []
-    begin = time.perf_counter()
-
-    def listen(event: str, duration_secs: float, **_):
-        if event.startswith("/jax/core/compile/"):
-            now = time.perf_counter()
-            spans.append((now - duration_secs, now))
-
-    def spent():
-        # Traces within traces are reported each: count the union.
-        compiling, last = 0.0, begin
-        for first, end in sorted(spans):
-            compiling += max(end - max(first, last), 0)
-            last = max(last, end)
-        return compiling, finish - begin - compiling
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        yield spent
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
-        finish = time.perf_counter()

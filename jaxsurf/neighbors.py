@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from .arguments import as_float, finite, is_array, is_concrete, point_indices, raise_at, real, whole
 from .checks import check_count, check_orientation, check_overlap, check_spacing, two_sheets
 from .cloud import PointCloud
-from .nearest import distance_key, judge, nearest, without_islands
+from .sheets import distance_key, judge, nearest, without_islands
 
 
 class Neighbors(eqx.Module):

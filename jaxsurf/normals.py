@@ -16,9 +16,9 @@ from .arguments import as_float, in_range, instance, is_concrete, mask, raise_at
 from .checks import check_count, check_spacing
 from .cloud import PointCloud
 from .frames import frames_of
-from .nearest import nearest
 from .neighbors import Neighbors
 from .orient import check_one_sided, orient_normals, plane_normals
+from .sheets import nearest
 
 # Below this smallest pivot of the scaled normal equations, times the round-off, a fit is noise.
 _PIVOT = 100

@@ -14,8 +14,8 @@ from jaxsurf.checks import two_sheets
 from jaxsurf.cloud import PointCloud
 from jaxsurf.curvature import tube_ratio
 from jaxsurf.io import read
-from jaxsurf.nearest import nearest
 from jaxsurf.neighbors import find_neighbors, nearest_of
+from jaxsurf.sheets import nearest
 
 ARMADILLO = Path(__file__).parents[2] / "shared" / "data" / "armadillo.obj"
 

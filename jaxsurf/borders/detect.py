@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from ..arguments import instance, is_concrete, real, whole
 from ..cloud import PointCloud
 from ..frames import tangent_frames
-from ..nearest import nearest
+from ..sheets import nearest
 
 # Neighbours looked at for the largest empty angle, and the angle that makes a border.
 _RING, _GAP = 16, 2.1

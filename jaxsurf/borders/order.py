@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 
 from ..arguments import instance, is_concrete
 from ..cloud import PointCloud
-from ..nearest import distance_key
 from ..shapes.meshes import TriangleMesh
+from ..sheets import distance_key
 from .border import Border, checked_border
 
 # Points in a row that the border is interpolated through.

@@ -12,6 +12,8 @@ import numpy as np
 
 from .arguments import is_concrete
 
+AnyArray = jax.Array | np.ndarray
+
 # Quicker to compile, slower to run; `is_quick` asks for simpler forms beside.
 _QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 # Numbers given to a program, in all its arrays, below which it is small.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .arguments import as_float, is_concrete, raise_at
+from .compiling import AnyArray, namespace
 
 
 def tangent_frames(normals: Float[Array, "*n d"]) -> Float[Array, "*n d d"]:
@@ -41,19 +41,22 @@ def tangent_frames(normals: Float[Array, "*n d"]) -> Float[Array, "*n d d"]:
         length = np.atleast_1d(np.linalg.norm(np.asarray(normals), axis=-1))
         off = ~(np.abs(length - 1) < 100 * np.sqrt(np.finfo(normals.dtype).eps))
         raise_at(off.ravel(), "normal {i} has length {v}, expected 1", length.ravel())
-    return frames_of(normals)
+    return _compiled(normals)
 
 
-@jax.jit
-def frames_of(normals: Float[Array, "*n d"]) -> Float[Array, "*n d d"]:
+def frames_of(normals: Float[AnyArray, "*n d"]) -> Float[AnyArray, "*n d d"]:
     """`tangent_frames` of normals that are not looked at, such as those of switched-off rows."""
+    xp = namespace(normals)
     if normals.shape[-1] == 2:
         x, y = normals[..., 0], normals[..., 1]
-        return jnp.stack([jnp.stack([y, -x], axis=-1), normals], axis=-2)
+        return xp.stack([xp.stack([y, -x], axis=-1), normals], axis=-2)
     x, y, z = normals[..., 0], normals[..., 1], normals[..., 2]
-    side = jnp.where(z >= 0, 1, -1).astype(normals.dtype)
+    side = xp.where(z >= 0, 1, -1).astype(normals.dtype)
     bend = -1 / (z + side)
     shear = x * y * bend
-    first = jnp.stack([1 + side * x * x * bend, side * shear, -side * x], axis=-1)
-    second = jnp.stack([shear, side + y * y * bend, -y], axis=-1)
-    return jnp.stack([first, second, normals], axis=-2)
+    first = xp.stack([1 + side * x * x * bend, side * shear, -side * x], axis=-1)
+    second = xp.stack([shear, side + y * y * bend, -y], axis=-1)
+    return xp.stack([first, second, normals], axis=-2)
+
+
+_compiled = jax.jit(frames_of)

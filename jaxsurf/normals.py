@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import warnings
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +13,10 @@ from scipy.spatial import cKDTree
 from .arguments import as_float, in_range, instance, is_concrete, mask, raise_at, whole
 from .checks import check_count, check_spacing
 from .cloud import PointCloud
-from .frames import frames_of
+from .compiling import sized_jit
+from .fits.kernels import bell, enclosing
+from .fits.monomials import polynomial_count
+from .fits.plane import TangentPlane, dot
 from .neighbors import Neighbors
 from .orient import check_one_sided, orient_normals, plane_normals
 from .sheets import nearest
@@ -114,7 +115,7 @@ def estimate_normals(
     instance(orient, (bool, np.bool_), "orient")
     n, dim = points.shape
     x = np.asarray(points)
-    needed = len(_exponents(dim - 1, degree)) + 1
+    needed = polynomial_count(dim - 1, degree)
     if k is None:
         k = 3 * needed if dim == 3 else 2 * needed + 1
     _check_fit(k, degree, needed)
@@ -211,7 +212,7 @@ def refit_normals(
         raise ValueError(f"neighbors are those of {neighbors.n} points, there are {n}")
     whole(iterations, "iterations", least=1)
     whole(batch_size, "batch_size", least=1)
-    needed = len(_exponents(points.shape[1] - 1, whole(degree, "degree", least=1))) + 1
+    needed = polynomial_count(points.shape[1] - 1, whole(degree, "degree", least=1))
     _check_fit(neighbors.k, degree, needed)
     on, count = neighbors.mask[:, 0], neighbors.mask.sum(axis=1)
     if is_concrete(count):
@@ -223,9 +224,10 @@ def refit_normals(
     radius = neighbors.radius
     if radius is not None:
         radius = jnp.broadcast_to(jnp.asarray(radius, points.dtype), n)
-    i = jnp.arange(n)
     slots, accepted = neighbors.indices, neighbors.mask
-    fitted = _refit(points, i, normals, slots, accepted, radius, degree, iterations, batch_size)[0]
+    fitted, pivot = _refit(points, normals, slots, accepted, radius, degree, iterations, batch_size)
+    determined = pivot > needed * jnp.finfo(points.dtype).eps
+    fitted = jnp.where(determined[:, None], fitted, jnp.nan)
     cosine = jnp.sum(fitted * normals, axis=1)
     if is_concrete(cosine, on):
         raise_at(
@@ -282,7 +284,7 @@ def _settle(points, guess, slots, mask, degree: int, iterations: int):
             i = np.resize(part, chunk)
             new, low = (
                 np.asarray(a)[: len(part)]
-                for a in _refit(points, i, normals[i], slots[i], mask[i], None, degree, 1, 256)
+                for a in _refit(points, normals[i], slots[i], mask[i], None, degree, 1, 256)
             )
             step = new - normals[part]
             size = np.linalg.norm(step, axis=1)
@@ -297,114 +299,35 @@ def _settle(points, guess, slots, mask, degree: int, iterations: int):
     return normals, pivot, turn
 
 
-@partial(jax.jit, static_argnames=("degree", "iterations", "batch_size"))
-def _refit(points, i, normals, slots, mask, radius, degree, iterations, batch_size):
-    """New normals of points i, and the smallest scaled pivot of each fit."""
-    exponents = _exponents(points.shape[1] - 1, degree)
+@sized_jit
+def _refit(points, normals, slots, mask, radius, degree: int, iterations: int, batch_size: int):
+    """New normals of the points in the first slots, and the smallest scaled pivot of each fit."""
 
-    def row(i, normal, slots, mask, radius):
-        d = points[slots] - points[i]
-        squared = jnp.sum(d * d, axis=1)
-        reach = _reach(squared, mask) if radius is None else radius**2
-        weights = jnp.where(mask, _weight(squared / reach), 0)
-        d = d / jnp.sqrt(reach)
+    def row(normal, slots, mask, radius):
+        offsets = points[slots] - points[slots[0]]
+        squared = dot(offsets, offsets)
+        reach = enclosing(squared, mask) if radius is None else radius**2
+        weights = jnp.where(mask, bell(squared / reach), 0)
+        reach = jnp.sqrt(reach)
 
         def step(normal, _):
-            frame = frames_of(normal)
-            q = d @ frame.T
-            basis = _monomials(q[:, :-1], exponents)
-            slope, pivot = _least_squares(basis, weights, q[:, -1], mask[0])
+            plane = TangentPlane.at(normal, offsets, weights, reach, reach)
+            graph, condition = plane.surface(1, degree)
+            # Without what was added to the matrix, see `systems.factor`.
+            pivot = 1 / condition - 4 * len(graph) * jnp.finfo(condition.dtype).eps
             # The linear monomials come first.
-            new = normal - slope[: len(frame) - 1] @ frame[:-1]
-            return new / jnp.linalg.norm(new), pivot
+            return plane.tilted(normal, graph[: len(plane.tangents)]), pivot
 
         fitted, pivot = jax.lax.scan(step, normal, length=iterations)
         return jnp.where(mask[0], fitted, normal), pivot[-1]
 
     # Whole blocks only: an incomplete one would be compiled a second time.
-    batch = min(batch_size, len(i))
-    which = jnp.arange(-(-len(i) // batch) * batch) % len(i)
+    n = len(normals)
+    batch = min(batch_size, n)
+    which = jnp.arange(-(-n // batch) * batch) % n
     results = jax.lax.map(
-        lambda r: row(*jax.tree.map(lambda a: a[r], (i, normals, slots, mask, radius))),
+        lambda r: row(*jax.tree.map(lambda a: a[r], (normals, slots, mask, radius))),
         which,
         batch_size=batch,
     )
-    return jax.tree.map(lambda a: a[: len(i)], results)
-
-
-def _reach(squared: Float[Array, " k"], mask: Bool[Array, " k"]) -> Float[Array, ""]:
-    """Smooth stand-in for the largest squared distance, never below it."""
-    scale = jnp.where(mask[0], jax.lax.stop_gradient(jnp.max(squared)), 1)
-    total = jnp.sum(jnp.where(mask, squared / scale, 0) ** 8)
-    return jnp.where(mask[0], scale * jnp.where(mask[0], total, 1) ** (1 / 8), 1)
-
-
-def _weight(t: Float[Array, " k"]) -> Float[Array, " k"]:
-    """Bell of the squared relative distance; zero from 1 on, with two derivatives."""
-    return jnp.exp(-2 * t) * jnp.maximum(1 - t, 0) ** 3
-
-
-def _exponents(dim: int, degree: int) -> np.ndarray:
-    """Exponents of the monomials of degree 1 to `degree`, by degree."""
-    powers = itertools.product(range(degree + 1), repeat=dim)
-    chosen = sorted((e for e in powers if 0 < sum(e) <= degree), key=lambda e: (sum(e), e[::-1]))
-    return np.array(chosen).reshape(-1, dim)
-
-
-def _monomials(q: Float[Array, "k m"], exponents: np.ndarray) -> Float[Array, "k b"]:
-    one = jnp.ones(len(q), q.dtype)
-    powers = [[one] for _ in q.T]
-    for a, column in enumerate(q.T):
-        for _ in range(exponents.max()):
-            powers[a].append(powers[a][-1] * column)
-    columns = []
-    for e in exponents:
-        column = powers[0][e[0]]
-        for a in range(1, len(e)):
-            column = column * powers[a][e[a]]
-        columns.append(column)
-    return jnp.stack(columns, axis=1)
-
-
-def _least_squares(basis, weights, values, on):
-    r"""Coefficients c that minimise $\sum_j w_j (V_j c - z_j)^2$, and the smallest pivot.
-
-    One step of refinement on the residual makes up for what squaring the condition number
-    loses, which matters in float32.
-    """
-    gram = basis.T @ (weights[:, None] * basis)
-    gram = jnp.where(on, gram, jnp.eye(len(gram), dtype=gram.dtype))
-    size = 1 / jnp.sqrt(jax.lax.stop_gradient(jnp.diag(gram)))
-    factor = jnp.linalg.cholesky(gram * size[:, None] * size)
-    pivot = jnp.min(jnp.diag(jax.lax.stop_gradient(factor))) ** 2
-    factor, size = jax.lax.stop_gradient((factor, size))
-    return _solve(factor, size, basis, weights, values), pivot
-
-
-@jax.custom_jvp
-def _solve(factor, size, basis, weights, values):
-    return _solve_with(factor, size, basis, weights, values)
-
-
-def _solve_with(factor, size, basis, weights, values):
-    def correct(residual):
-        right = basis.T @ (weights * residual)
-        return size * jax.scipy.linalg.cho_solve((factor, True), size * right)
-
-    c = correct(values)
-    return c + correct(values - basis @ c)
-
-
-@_solve.defjvp
-def _solve_jvp(primals, tangents):
-    # Differentiate VᵀW(z − V c) = 0; the factorisation itself needs no derivative.
-    factor, size, basis, weights, values = primals
-    _, _, d_basis, d_weights, d_values = tangents
-    c = _solve(*primals)
-    residual = values - basis @ c
-    right = (
-        d_basis.T @ (weights * residual)
-        + basis.T @ (d_weights * residual)
-        + basis.T @ (weights * (d_values - d_basis @ c))
-    )
-    return c, size * jax.scipy.linalg.cho_solve((factor, True), size * right)
+    return jax.tree.map(lambda a: a[:n], results)

@@ -100,7 +100,7 @@ def _surfaces(blocks, degree: int):
 
     def fit(block):
         plane = TangentPlane.of(neighborhood(block), degree)
-        return plane, Graph(plane.surface(degree), degree, len(plane.points))
+        return plane, Graph(plane.surface(1, degree)[0], degree, len(plane.points))
 
     return blockwise(fit, blocks)
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..frames import tangent_frames
+from ..compiling import AnyArray, namespace
+from ..frames import frames_of
 from .kernels import gaussian, support
 from .moments import polynomial_fit
 
@@ -46,12 +46,12 @@ class TangentPlane(eqx.Module):
         radius: where the weights vanish.
     """
 
-    tangents: Float[Array, "t d *p"]
-    points: Float[Array, "t k *p"]
-    heights: Float[Array, "k *p"]
-    weights: Float[Array, "k *p"]
-    width: Float[Array, "*p"]
-    radius: Float[Array, "*p"]
+    tangents: Float[AnyArray, "t d *p"]
+    points: Float[AnyArray, "t k *p"]
+    heights: Float[AnyArray, "k *p"]
+    weights: Float[AnyArray, "k *p"]
+    width: Float[AnyArray, "*p"]
+    radius: Float[AnyArray, "*p"]
 
     @classmethod
     def of(
@@ -60,21 +60,35 @@ class TangentPlane(eqx.Module):
         """With the kernel that suits polynomials of a degree, or another (see `GFDM`)."""
         radius = around.support(around.offsets.shape[1] - 1, support)
         unit = radius * (_width(degree) if width is None else width)
-        frame = jnp.moveaxis(tangent_frames(around.normals[0].T), 0, -1)
-        along = [dot(around.offsets, axis[None]) / unit for axis in frame]
         weights = gaussian(around.squared, unit, radius, around.mask)
-        points = jnp.stack(along[:-1])
-        return cls(frame[:-1], points, along[-1], weights, unit, radius)
+        return cls.at(around.normals[0], around.offsets, weights, unit, radius)
 
-    def surface(self, degree: int) -> Float[Array, "m *p"]:
-        """Coefficients of the surface as a graph over the plane, of degrees 1 to `degree`."""
-        return polynomial_fit(self.points, self.weights, self.heights[None], 1, degree)[:, 0]
+    @classmethod
+    def at(cls, normal, offsets, weights, width, radius) -> TangentPlane:
+        """With weights of its own, perpendicular to a normal `(d, *p)`; also in NumPy."""
+        xp = namespace(normal)
+        frame = xp.moveaxis(frames_of(normal.T), (-2, -1), (0, 1))
+        along = [dot(offsets, axis[None]) / width for axis in frame]
+        return cls(frame[:-1], xp.stack(along[:-1]), along[-1], weights, width, radius)
+
+    def surface(self, low: int, high: int) -> tuple[Float[AnyArray, "m *p"], Float[AnyArray, "*p"]]:
+        """The surface as a graph over the plane: coefficients of degrees `low` to `high`.
+
+        With the condition number of the fit, see `polynomial_fit`.
+        """
+        fitted, condition = polynomial_fit(self.points, self.weights, self.heights[None], low, high)
+        return fitted[:, 0], condition
+
+    def tilted(self, normal, slopes) -> Float[AnyArray, "d *p"]:
+        """Unit normal of a graph over the plane with this normal, `(d, *p)`, and these slopes."""
+        new = normal - sum(slope * axis for slope, axis in zip(slopes, self.tangents))
+        return new / namespace(new).sqrt(sum(x * x for x in new))
 
 
 def _width(degree: int) -> float:
     return 0.36 if degree <= 2 else 0.315
 
 
-def dot(a: Float[Array, "k d *p"], b: Float[Array, "#k d *p"]) -> Float[Array, "k *p"]:
+def dot(a: Float[AnyArray, "k d *p"], b: Float[AnyArray, "#k d *p"]) -> Float[AnyArray, "k *p"]:
     """Scalar products; written out, as sums over an axis between others are slow."""
     return sum((a[:, i] * b[:, i] for i in range(1, a.shape[1])), a[:, 0] * b[:, 0])

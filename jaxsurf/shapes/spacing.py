@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-AnyArray = Array | np.ndarray
+from jaxsurf.compiling import AnyArray
 
 # Points are numbered in 32 bits.
 MOST = 2**31 - 1

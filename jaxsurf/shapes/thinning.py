@@ -7,7 +7,8 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from jaxsurf.arguments import in_range, on_host, raise_at, real, whole
-from jaxsurf.shapes.spacing import AnyArray, same_sheet
+from jaxsurf.compiling import AnyArray
+from jaxsurf.shapes.spacing import same_sheet
 
 # A maximal Poisson-disk subset of about six random candidates a point, no two closer than this
 # fraction of h, has about one point per h^(d-1).

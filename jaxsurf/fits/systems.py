@@ -72,10 +72,8 @@ def factor(gram):
     small = isinstance(gram, list)
     a = jnp.stack([jnp.stack(row) for row in gram]) if small else gram
     diagonal = _diagonal(a)
-    if namespace(a) is np:
-        scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
-    else:
-        scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
+    rsqrt = jax.lax.rsqrt if namespace(a) is jnp else lambda x: 1 / np.sqrt(x)
+    scale = rsqrt(namespace(a).where(diagonal > 0, diagonal, 1))
     a = a * scale * scale[:, None]
     shift = 4 * len(a) * jnp.finfo(a.dtype).eps
     solve_scaled, pivot = (_by_columns if small else _by_lapack)(a, shift)

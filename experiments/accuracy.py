@@ -11,7 +11,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 import jaxsurf as js
-from jaxsurf.frames import estimate_normals
+from jaxsurf.normals import estimate_normals
 
 from . import surfaces
 from .benchmarks.cases import METHODS as TIMED

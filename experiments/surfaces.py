@@ -13,7 +13,9 @@ from jaxtyping import Array, Float
 
 import jaxsurf as js
 from jaxsurf.shapes import analytic
-from jaxsurf.shapes.sampling import Project, ideal_spacing, jitter, thin
+from jaxsurf.shapes.sampling import Project, jitter
+from jaxsurf.shapes.spacing import ideal_spacing
+from jaxsurf.shapes.thinning import thin
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,11 @@
 Points, then neighbours, then stencils, then operators: `import jaxsurf as js`.
 """
 
-from .borders import Border as Border
-from .borders import border_conormals as border_conormals
-from .borders import detect_border as detect_border
-from .borders import find_border as find_border
+from .borders.border import Border as Border
+from .borders.detect import detect_border as detect_border
+from .borders.order import border_conormals as border_conormals
+from .borders.order import find_border as find_border
 from .boundary import Closure as Closure
-from .boundary import close as close
 from .build import choose_neighbors as choose_neighbors
 from .cells import SearchCapacity as SearchCapacity
 from .cells import allocate as allocate
@@ -24,11 +23,9 @@ from .curvature import mean_curvature as mean_curvature
 from .curvature import mean_curvature_vector as mean_curvature_vector
 from .curvature import principal_curvatures as principal_curvatures
 from .curvature import shape_tensor as shape_tensor
+from .curvature import tube_ratio as tube_ratio
 from .discretization import Discretization as Discretization
 from .discretization import discretize as discretize
-from .frames import estimate_normals as estimate_normals
-from .frames import from_points as from_points
-from .frames import refit_normals as refit_normals
 from .frames import tangent_frames as tangent_frames
 from .ghosts import with_ghosts as with_ghosts
 from .io import read as read
@@ -36,7 +33,10 @@ from .io import read_fields as read_fields
 from .io import write as write
 from .neighbors import Neighbors as Neighbors
 from .neighbors import find_neighbors as find_neighbors
-from .neighbors import tube_ratio as tube_ratio
+from .normals import estimate_normals as estimate_normals
+from .normals import from_points as from_points
+from .normals import refit_normals as refit_normals
+from .onesided import close as close
 from .operators import biharmonic as biharmonic
 from .operators import diffusion as diffusion
 from .operators import directional_derivative as directional_derivative
@@ -48,21 +48,21 @@ from .plot import plot_cloud as plot_cloud
 from .plot import plot_fields as plot_fields
 from .shapes.analytic import circle as circle
 from .shapes.analytic import ellipsoid as ellipsoid
-from .shapes.analytic import graph as graph
 from .shapes.analytic import sphere as sphere
-from .shapes.analytic import surface_of_revolution as surface_of_revolution
 from .shapes.analytic import torus as torus
-from .shapes.implicit import double_torus as double_torus
-from .shapes.implicit import level_set as level_set
+from .shapes.cleaning import clean_mesh as clean_mesh
 from .shapes.implicit import level_set_curvature as level_set_curvature
 from .shapes.implicit import level_set_normals as level_set_normals
 from .shapes.implicit import project_to_level_set as project_to_level_set
+from .shapes.level_sets import double_torus as double_torus
+from .shapes.level_sets import level_set as level_set
 from .shapes.meshes import TriangleMesh as TriangleMesh
-from .shapes.meshes import clean_mesh as clean_mesh
-from .shapes.meshes import sample_mesh as sample_mesh
 from .shapes.order import sort_cloud as sort_cloud
+from .shapes.parametric import graph as graph
+from .shapes.parametric import surface_of_revolution as surface_of_revolution
+from .shapes.resampling import sample_mesh as sample_mesh
 from .shapes.sampling import jitter as jitter
-from .shapes.sampling import poisson_disk as poisson_disk
+from .shapes.thinning import poisson_disk as poisson_disk
 from .solve.conserve import conservative_weights as conservative_weights
 from .solve.eigen import Eigenmodes as Eigenmodes
 from .solve.eigen import eigenmodes as eigenmodes

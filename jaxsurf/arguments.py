@@ -26,7 +26,7 @@ def is_concrete(*arrays: Any) -> bool:
 def without_derivatives(tree: Any) -> Any:
     """The values that are being differentiated, where they are known: what choices are made by.
 
-    Under `grad`, `jvp` and the like these are concrete arrays; of `jit` and `vmap` the tracers stay.
+    Under `grad` and `jvp` these are concrete arrays; the tracers of `jit` and `vmap` stay.
     """
     leaves, structure = jax.tree.flatten(tree)
     return jax.tree.unflatten(structure, [_beneath(x) for x in leaves])

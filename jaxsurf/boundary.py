@@ -13,7 +13,6 @@ $\dot v = P\,F(t, E v + e(t))$.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import zip_longest
 
 import equinox as eqx
@@ -23,16 +22,9 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int, Real
 
-from .arguments import as_float, instance, is_concrete, raise_at, real, whole
-from .borders import Border, checked_border, find_border, inward
-from .build import residual_tolerance, stencil_weights
-from .cloud import PointCloud
-from .conditions import Condition, checked_conditions
-from .neighbors import Neighbors, Rows, nearest_of
+from .arguments import as_float, is_concrete, raise_at, real, whole
+from .conditions import Condition
 from .stencils.algebra import AbstractOperator
-from .stencils.gfdm import GFDM
-from .stencils.method import AbstractMethod
-from .stencils.targets import Gradient
 
 # The factor of an unknown value has to be more than this share of its terms.
 _PIVOT = 1e-3
@@ -264,104 +256,6 @@ def _filled(u, rows, indices, weights, given):
     return u.at[rows].set(values.astype(u.dtype), unique_indices=True)
 
 
-def close(
-    cloud: PointCloud,
-    conditions: Condition | Sequence[Condition],
-    *,
-    neighbors: Neighbors | None = None,
-    method: AbstractMethod = GFDM(degree=2),
-    border: Border | None = None,
-    throw: bool = True,
-) -> Closure:
-    r"""Eliminate boundary conditions with one-sided stencils.
-
-    The derivative along the conormal is $\nu\cdot\nabla_S u$ by the stencils of `method` over
-    the point itself and its nearest free points, so that bound values never depend on each
-    other. Dirichlet conditions need no stencil, and hold on any set of points.
-
-    Args:
-        cloud: n points with unit normals. Points under no condition are free; on the border of
-            the surface they have to be named by `free`, or solvers refuse the operator.
-        conditions: one or several; together they may name a point twice only if they agree.
-        neighbors: lists for all n points, of which the free ones are used; if None, the
-            nearest free points are searched for (host only).
-        method: how the derivatives are computed; of the operator's order or one above. GFDM
-            serves DC-PSE operators too.
-        border: from `find_border`, for conormals on traced points; found where needed if None.
-        throw: check stencils and pivots (on concrete arrays).
-
-    Returns:
-        The map from free values to fields that meet the conditions.
-
-    Accuracy: bound values O(h^{p+1}) for GFDM(degree=p) and DCPSE(order=p). Largest relative
-        error of a screened Poisson problem with flux conditions on a spherical cap of 1,600
-        points: 1.6e-3 GFDM(2), 1.5e-5 GFDM(4), 6e-4 DCPSE(2) closed by GFDM(3), 1.3e-5 DCPSE(4)
-        closed by GFDM(4), with the orders of the operators (`tests/test_boundary.py`).
-    Differentiable: forward and reverse, in points, normals, values, a, b and conormals, for
-    fixed neighbours.
-    Raises:
-        TypeError: what is no cloud, condition, neighbours, method or border.
-        ValueError: contradictory conditions; no conormal, or one that is not tangent to the
-            surface or leads into it; a mask or neighbours of another number of points; fewer free
-            neighbours than the method needs; a + b w_i near zero, with w_i the weight of the point
-            itself in its conormal derivative (a Robin condition of the wrong sign); each with
-            the point.
-
-    Example:
-        >>> cloud = js.sphere(500)
-        >>> equator = jnp.abs(cloud.points[:, 2]) < 0.05
-        >>> closure = js.close(cloud, js.dirichlet(equator, 2.0))
-        >>> bool((closure(jnp.zeros(500)) == jnp.where(equator, 2.0, 0.0)).all())
-        True
-    """
-    conditions, owner = checked_conditions(cloud, conditions)
-    instance(method, AbstractMethod, "method", "as js.GFDM(degree=2)")
-    check_parts(cloud, neighbors, border)
-    free, declared = cloud.host_active.copy(), np.zeros(cloud.n, bool)
-    for condition in conditions:
-        declared[condition.where] = True
-        free[condition.where] &= condition.is_free
-    dtype = cloud.points.dtype
-
-    parts, sources, start = [], [], 0
-    for condition, own in zip(conditions, owner):
-        rows, m = condition.where[own], int(own.sum())
-        if condition.a is None or not m:  # free
-            continue
-        a = jnp.broadcast_to(condition.a, condition.m)[own].astype(dtype)
-        if condition.b is None:
-            pivot, slots, weights = a, jnp.zeros((0, m), jnp.int32), jnp.zeros((0, m), dtype)
-        else:
-            b = jnp.broadcast_to(condition.b, condition.m)[own].astype(dtype)
-            nu = _conormals(cloud, condition, rows, own, border)
-            near = _free_neighbors(cloud, rows, free, neighbors, method)
-            gradient, diagnostics = stencil_weights(cloud, near, method, Gradient(), rows)
-            w = jnp.einsum("md,kdm->km", nu, gradient)
-            pivot, slots, weights = a + b * w[0], near.indices.T[1:], -b * w[1:]
-            if throw and is_concrete(w, a, b):
-                size = np.abs(a) + np.abs(b) * np.abs(w).sum(axis=0)
-                _check_stencils(rows, near, diagnostics.residual, method, cloud.dim)
-                check_pivots(
-                    np.asarray(pivot), np.asarray(size), rows, "value at point {i}: a + b w_i"
-                )
-        parts.append((rows, slots, weights / pivot))
-        place = jnp.arange(start, start + m)
-        sources.append(Source(place, 1 / pivot, jnp.asarray(np.flatnonzero(own)), condition))
-        start += m
-    rows, indices, weights = stacked(parts, int(np.argmax(free)), dtype)
-    return Closure(cloud.n, rows, indices, weights, tuple(sources), jnp.asarray(declared))
-
-
-def check_parts(cloud, neighbors, border) -> None:
-    """Refuse neighbours and borders that are none, or of another cloud."""
-    if neighbors is not None:
-        instance(neighbors, Neighbors, "neighbors", "made by js.find_neighbors")
-        if neighbors.n != cloud.n:
-            raise ValueError(f"neighbours of {neighbors.n} points, the cloud has {cloud.n}")
-    if border is not None:
-        checked_border(border, cloud)
-
-
 def check_border(operator: AbstractOperator, conditions: Closure | None) -> None:
     """Refuse an operator on a surface with a border about which nothing is said.
 
@@ -388,131 +282,6 @@ def check_border(operator: AbstractOperator, conditions: Closure | None) -> None
             f"({int(left.sum())} such points), so that modes may grow there without bound. Close "
             "the border, conditions=js.close(cloud, [js.neumann(...), ...]), or say that it is "
             "free: js.close(cloud, js.free(cloud.boundary))"
-        )
-
-
-def stacked(parts, free: int, dtype):
-    """One table of rows, indices and weights; padding refers to a free point."""
-    nothing = (np.zeros(0, np.int32), jnp.zeros((0, 0), jnp.int32), jnp.zeros((0, 0), dtype))
-    parts = parts or [nothing]
-    k = max(len(slots) for _, slots, _ in parts)
-    padding = lambda x: ((0, k - len(x)), (0, 0))
-    rows = np.concatenate([rows for rows, _, _ in parts])
-    indices = [jnp.pad(jnp.asarray(s), padding(s), constant_values=free) for _, s, _ in parts]
-    weights = [jnp.pad(w, padding(w)) for _, _, w in parts]
-    return jnp.asarray(rows), jnp.concatenate(indices, axis=1), jnp.concatenate(weights, axis=1)
-
-
-# --- one-sided stencils --------------------------------------------------------------------
-
-
-def _conormals(cloud, condition, rows, own, border) -> Float[Array, "m d"]:
-    """Those of the condition; else those of the border."""
-    if condition.conormals is not None:
-        _check_conormals(cloud, condition)
-        return condition.conormals[own].astype(cloud.points.dtype)
-    if border is None and cloud.boundary is not None:
-        border = find_border(cloud)
-    place = np.full(cloud.n, -1)
-    if border is not None:
-        place[np.asarray(border.points)] = np.arange(len(border.points))
-    lacking = place[rows] < 0
-    if lacking.any():
-        raise ValueError(
-            f"no conormal at point {rows[np.argmax(lacking)]}: it is not on the border of the "
-            f"cloud ({int(lacking.sum())} such points); mark it in `boundary` or give conormals"
-        )
-    assert border is not None
-    return border.conormals(cloud)[place[rows]]
-
-
-# The sine of the angle that a conormal may be off the tangent plane: 3 degrees.
-_OFF = 0.05
-
-
-def _check_conormals(cloud, condition) -> None:
-    """Given conormals have to be tangent to the surface, and to lead out of it at its border."""
-    conormals, where = condition.conormals, condition.where
-    if conormals.shape[1] != cloud.dim:
-        raise ValueError(f"conormals have shape {conormals.shape}, expected (..., {cloud.dim})")
-    if not is_concrete(conormals, cloud.points, cloud.normals, cloud.boundary):
-        return
-    nu, normals = np.asarray(conormals), np.asarray(cloud.normals)[where]
-    normal = np.abs(np.einsum("md,md->m", nu, normals))
-    bad = np.flatnonzero(normal > _OFF)
-    if bad.size:
-        raise ValueError(
-            f"the conormal at point {where[bad[0]]} is not tangent to the surface: its normal part "
-            f"is {normal[bad[0]]:.3g}, expected at most {_OFF} ({bad.size} such points)"
-        )
-    if cloud.boundary is None:
-        return
-    at_border = np.flatnonzero(np.asarray(cloud.boundary)[where])
-    inside = inward(np.asarray(cloud.points), np.flatnonzero(cloud.host_active), where[at_border])
-    along = np.einsum("md,md->m", nu[at_border], inside)
-    bad = np.flatnonzero(along > 0.3 * np.linalg.norm(inside, axis=1))
-    if bad.size:
-        raise ValueError(
-            f"the conormal at point {where[at_border[bad[0]]]} leads into the surface, expected "
-            f"outward ({bad.size} such points)"
-        )
-
-
-def _free_neighbors(cloud, rows, free, neighbors, method) -> Rows:
-    """Every row's own point, then free ones by distance; padding repeats a free one."""
-    need = method.basis_size(cloud.dim, Gradient())
-    radius = None
-    if neighbors is None:
-        if not is_concrete(cloud.points, cloud.normals):
-            raise ValueError("neighbors=None needs concrete arrays; under jit pass the neighbours")
-        indices, mask = _nearest_free(cloud, rows, free, method.neighbor_count(cloud.dim))
-    else:
-        if not is_concrete(neighbors.indices, neighbors.mask):
-            raise ValueError("neighbours must be concrete: which points are free decides shapes")
-        indices, mask = (np.asarray(x)[rows] for x in (neighbors.indices, neighbors.mask))
-        indices, mask = _compacted(indices, mask & (free[indices] | (indices == rows[:, None])))
-        if neighbors.radius is not None:
-            radius = jnp.broadcast_to(neighbors.radius, cloud.n)
-    count = mask.sum(axis=1)
-    if count.min() < need:
-        i = int(np.argmin(count))
-        raise ValueError(
-            f"point {rows[i]} has {count[i] - 1} free neighbours, {method} needs at least "
-            f"{need - 1} besides the point itself ({int(np.sum(count < need))} such points)"
-        )
-    indices = np.where(mask, indices, indices[:, 1:2])
-    return Rows(jnp.asarray(indices), jnp.asarray(mask), radius)
-
-
-def _nearest_free(cloud, rows, free, k):
-    """The k nearest of own point and free points, from as many candidates as it takes."""
-    available = int(cloud.host_active.sum())
-    count = min(2 * k, available)
-    while True:
-        indices, mask = nearest_of(cloud, rows, count)
-        mask = mask & (free[indices] | (indices == rows[:, None]))
-        if count == available or mask.sum(axis=1).min() >= k or count >= 8 * k:
-            return _compacted(indices, mask, k)
-        count = min(2 * count, available)
-
-
-def _compacted(indices, mask, k=None):
-    """The slots in use first, in their order; of these the first k."""
-    order = np.argsort(~mask, axis=1, kind="stable")
-    width = int(mask.sum(axis=1).max()) if k is None else min(k, int(mask.sum(axis=1).max()))
-    order = order[:, :width]
-    return np.take_along_axis(indices, order, axis=1), np.take_along_axis(mask, order, axis=1)
-
-
-def _check_stencils(rows, near, residual, method, dim) -> None:
-    residual = np.asarray(residual)
-    bad = np.flatnonzero(~(residual < residual_tolerance(residual.dtype)))
-    if bad.size:
-        i = bad[0]
-        raise ValueError(
-            f"degenerate one-sided stencil at point {rows[i]}: relative moment residual "
-            f"{residual[i]:.1e} with {int(near.mask[i].sum()) - 1} free neighbours, {method} needs "
-            f"{method.basis_size(dim, Gradient()) - 1} in general position ({bad.size} such points)"
         )
 
 

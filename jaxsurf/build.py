@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .arguments import instance, is_concrete
+from .arguments import instance, is_concrete, refuse
 from .arguments import mask as checked_mask
 from .cloud import PointCloud
 from .compiling import copying_jit, namespace, sized_jit
+from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .neighbors import Neighbors, Rows, find_neighbors, nearest_of
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood
-from .stencils.moments import blockwise, in_blocks, out_of_blocks
 from .stencils.stencil import Stencil
 from .stencils.targets import Laplacian
 
@@ -296,3 +296,12 @@ def _check(stencil: Stencil, neighbors, method, target, dim) -> None:
             "support",
             stacklevel=4,
         )
+
+
+def determined(weights, residual, degree: int):
+    """The weights of local polynomials, refused where the neighbours do not determine these."""
+    text = (
+        f"the neighbours of point {{i}} do not determine a polynomial of degree {degree}: relative "
+        "moment residual {v:.1e}"
+    )
+    return refuse(weights, ~(residual < residual_tolerance(residual.dtype)), text, residual)

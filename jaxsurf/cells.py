@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from .arguments import as_float, finite, instance, is_concrete, mask, real, whole
-from .neighbors import Neighbors, cosine_slack
+from .neighbors import Neighbors
+from .sheets import cosine_slack
 
 # Cells are a little wider than the radius, so that rounding puts no neighbour two cells away.
 _MARGIN = 1.01

@@ -233,3 +233,48 @@ def along_tangents(tensor, normals):
     """The shape tensor as a symmetric 2 x 2 matrix, and the tangents that it refers to."""
     tangents = frames_of(normals)[:, :2]
     return jnp.einsum("nap,npq,nbq->nab", tangents, tensor, tangents), tangents
+
+
+def tube_ratio(cloud: PointCloud, neighbors: Neighbors) -> Float[Array, " n"]:
+    r"""Largest normal curvature that each point sees among its neighbours.
+
+    $\max_j |(x_j-x_i)\cdot(n_j-n_i)|\,/\,|x_j-x_i|^2$. Times the radius of the support it says
+    how far the surface bends within one stencil: above 1 the lines along the normals meet
+    within the support, and points copied along them land among each other.
+
+    Args:
+        cloud: n points with unit normals.
+        neighbors: which points to compare with.
+
+    Returns:
+        One number per point, `(n,)`, in 1 / length; 0 for a point without neighbours.
+
+    Differentiable: forward and reverse, in points and normals, for fixed neighbours.
+
+    Example:
+        >>> angle = 2 * jnp.pi * jnp.arange(50) / 50
+        >>> circle = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+        >>> cloud = js.PointCloud(2 * circle, circle)
+        >>> float(js.tube_ratio(cloud, js.find_neighbors(cloud, k=5)).max().round(6))
+        0.5
+    """
+
+    instance(cloud, PointCloud, "cloud")
+    instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
+    if neighbors.n != cloud.n:
+        raise ValueError(f"neighbors of {neighbors.n} points, the cloud has {cloud.n}")
+    return _bend(cloud.points, cloud.normals, neighbors.indices.T, neighbors.mask.T)
+
+
+@jax.jit
+def _bend(points, normals, slots, masks):
+    # One column of neighbours at a time: nothing of size (n, k, d) is stored.
+    def bend(column):
+        slot, mask = column
+        d = points[slot] - points
+        squared = jnp.sum(d * d, axis=1)
+        used = mask & (squared > 0)
+        turn = jnp.sum(d * (normals[slot] - normals), axis=1)
+        return jnp.where(used, jnp.abs(turn) / jnp.where(used, squared, 1), 0)
+
+    return jnp.max(jax.lax.map(bend, (slots, masks)), axis=0)

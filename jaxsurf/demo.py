@@ -5,40 +5,37 @@ What `jaxsurf demo` computes, and the notebook after it; the command line only p
 
 from __future__ import annotations
 
-import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
-import jax.monitoring
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .boundary import Closure, close
+from .boundary import Closure
 from .cloud import PointCloud
 from .conditions import dirichlet
 from .curvature import shape_tensor
-from .formats import contents_of
-from .frames import tangent_frames
+from .formats.by_suffix import contents_of
+from .heat import Heat, cell_areas, diffuse, spot
 from .io import read, write
 from .neighbors import Neighbors
+from .onesided import close
 from .operators import laplace_beltrami
 from .plot import plot_fields
-from .shapes.implicit import double_torus, level_set, level_set_normals, project_to_level_set
+from .shapes.implicit import level_set_normals, project_to_level_set
+from .shapes.level_sets import double_torus, level_set
 from .spectrum import Spectrum, spectral_estimate
+from .stages import noted, timed
 from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil
-from .time.explicit import RKC2
-from .time.integrate import integrate
-from .time.pde import AdvectionDiffusionReaction
 
 STAGES = ("points", "operator", "spectrum", "curvature", "heat", "files")
 
@@ -104,42 +101,6 @@ def _scaled(cloud: PointCloud, scale: float | Float[Array, ""]) -> PointCloud:
     return eqx.tree_at(lambda c: c.points, cloud, scale * cloud.points)
 
 
-# --- heat ----------------------------------------------------------------------------------
-
-
-def cell_areas(cloud: PointCloud, neighbors: Neighbors, *, rays: int = 120) -> Float[Array, " n"]:
-    r"""Area of each point's Voronoi cell in its tangent plane (length of it on a curve).
-
-    A cell reaches as far as $\min_j |d_j|^2/2 d_j\cdot e$ in direction e. On a border, where
-    it would be endless, cells end at the distance of the sixth neighbour.
-
-    Accuracy: O(h²) on quasi-uniform points.
-    """
-    slots = neighbors.indices[:, 1:20]
-    used = neighbors.mask[:, 1:20]
-    offsets = cloud.points[slots] - cloud.points[:, None]
-    tangents = tangent_frames(cloud.normals)[:, :-1]
-    flat = jnp.einsum("nkd,ntd->nkt", offsets, tangents)
-    squared = jnp.sum(flat**2, axis=2)
-    if cloud.dim == 2:
-        directions = jnp.array([[1.0], [-1.0]])
-        share, power = 1.0, 1
-    else:
-        angle = 2 * jnp.pi * jnp.arange(rays) / rays
-        directions = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
-        share, power = float(jnp.pi / rays), 2
-    farthest = jnp.sqrt(squared[:, min(5, slots.shape[1] - 1)])
-
-    def add(total, direction):
-        ahead = flat @ direction
-        reach = jnp.where(
-            used & (ahead > 0), squared / (2 * jnp.where(ahead > 0, ahead, 1)), jnp.inf
-        )
-        return total + jnp.minimum(jnp.min(reach, axis=1), farthest) ** power, None
-
-    return share * jax.lax.scan(add, jnp.zeros(cloud.n, flat.dtype), directions)[0]
-
-
 def central_point(surface: Surface) -> int:
     """The point in the middle of the picture."""
     points = np.asarray(surface.cloud.points)
@@ -148,45 +109,6 @@ def central_point(surface: Surface) -> int:
     height = points @ view / np.linalg.norm(view)
     aside = np.sqrt(np.maximum(np.sum(points**2, axis=1) - height**2, 0))
     return int(np.argmax(height - 3 * aside))
-
-
-class Heat(NamedTuple):
-    """How long, in how many steps, when to look, and a bound of the operator's eigenvalues."""
-
-    until: float
-    steps: int
-    frames: tuple[float, ...]
-    radius: float
-
-    @staticmethod
-    def within(until: float, radius: float) -> Heat:
-        """Steps short enough for a hot spot; what else stability asks for, RKC2's stages give."""
-        return Heat(until, _STEPS, (0.0, until / 5, until), _MARGIN * radius)
-
-
-# The spectral radius is estimated from below.
-_STEPS, _MARGIN = 40, 1.2
-
-
-def diffuse(
-    laplacian: Stencil, conditions: Closure | None, start: Float[Array, " n"], heat: Heat
-) -> Float[Array, "frames n"]:
-    r"""Temperatures $u_t = \Delta_S u$ at the frames; borders keep theirs.
-
-    Differentiable in the operator and the start.
-    """
-    if conditions is not None:
-        held = start[conditions.rows]
-        conditions = eqx.tree_at(lambda c: c.sources[0].condition.value, conditions, held)
-    return integrate(
-        AdvectionDiffusionReaction(laplacian, conditions=conditions),
-        start,
-        t1=heat.until,
-        solver=RKC2(spectral_radius=heat.radius),
-        # Given steps make the end a smooth function of the surface.
-        dt0=heat.until / heat.steps,
-        saveat=diffrax.SaveAt(ts=jnp.asarray(heat.frames, start.dtype)),
-    ).ys  # type: ignore[return-value]
 
 
 # --- the whole -----------------------------------------------------------------------------
@@ -268,7 +190,7 @@ def run(
     @contextmanager
     def stage(name: str):
         tell(name)
-        with _timed() as spent, _noted(notes):
+        with timed() as spent, noted(notes):
             yield
         seconds[name] = spent()
 
@@ -286,7 +208,7 @@ def run(
     with stage("heat"):
         areas = cell_areas(cloud, neighbors)
         source = central_point(surface)
-        start = _spot(cloud, source, surface.size / 16)
+        start = spot(cloud, source, surface.size / 16)
         heat = Heat.within(until or _rounded(surface.size**2 / 100), float(spectrum.radius))
         probe = _probe(cloud, source, float(np.sqrt(2 * heat.until)))
         # One program for heat, gradient and difference: another takes longer to compile than it
@@ -393,11 +315,6 @@ def _curvature(cloud, neighbors, method) -> dict[str, Float[Array, " n"]]:
     return {"mean": trace / 2, "Gauss": (trace**2 - jnp.sum(tensor**2, axis=(1, 2))) / 2}
 
 
-def _spot(cloud: PointCloud, source: int, width: float) -> Float[Array, " n"]:
-    squared = jnp.sum((cloud.points - cloud.points[source]) ** 2, axis=1)
-    return jnp.exp(-squared / (2 * width**2))
-
-
 def _probe(cloud: PointCloud, source: int, distance: float) -> int:
     """A point at about that distance from the source, on its side of the surface."""
     points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
@@ -409,40 +326,3 @@ def _probe(cloud: PointCloud, source: int, distance: float) -> int:
 
 def _rounded(value: float) -> float:
     return float(f"{value:.1g}")
-
-
-@contextmanager
-def _noted(notes: list[str]) -> Iterator[None]:
-    """Collect the package's warnings as notes for the report."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("ignore")
-        warnings.simplefilter("always", UserWarning)
-        yield
-    notes += [str(warning.message) for warning in caught]
-
-
-@contextmanager
-def _timed() -> Iterator[Callable[[], tuple[float, float]]]:
-    """Seconds spent compiling, and on everything else."""
-    spans: list[tuple[float, float]] = []
-    begin = time.perf_counter()
-
-    def listen(event: str, duration_secs: float, **_):
-        if event.startswith("/jax/core/compile/"):
-            now = time.perf_counter()
-            spans.append((now - duration_secs, now))
-
-    def spent():
-        # Traces within traces are reported each: count the union.
-        compiling, last = 0.0, begin
-        for first, end in sorted(spans):
-            compiling += max(end - max(first, last), 0)
-            last = max(last, end)
-        return compiling, finish - begin - compiling
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        yield spent
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
-        finish = time.perf_counter()

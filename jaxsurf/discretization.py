@@ -10,25 +10,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from . import curvature, operators
-from .arguments import as_float, finite, instance, is_concrete, raise_at, refuse
-from .borders import Border, find_border
-from .build import build, choose_neighbors, residual_tolerance
+from . import curvature, operators, quadrature
+from .arguments import as_float, finite, instance, is_concrete, raise_at
+from .borders.border import Border
+from .borders.order import find_border
+from .build import build, choose_neighbors
 from .cloud import PointCloud
 from .compiling import copying_jit
-from .interpolation import interpolation_weights, nearest_points
+from .fits.monomials import polynomial_count
+from .interpolation import interpolated
 from .motion import CODES, carried, judged
 from .neighbors import Neighbors
-from .quadrature import cell_weights
 from .stencils.algebra import Composition
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod
-from .stencils.monomials import polynomial_count
 from .stencils.stencil import Stencil
 from .stencils.targets import Gradient, Joint, Laplacian
-
-# So many neighbours may bound a cell; where points are very uneven, all are tried.
-_CELLS = 24
 
 
 class _Kept:
@@ -207,17 +204,7 @@ class Discretization(eqx.Module):
         if self.border is not None:
             conormals = self.border.conormals(self.cloud)
             outward = jnp.zeros_like(self.cloud.points).at[self.border.points].set(conormals)
-        args = (self.cloud, self.neighbors, degree)
-        weights, closed, residual = cell_weights(*args, _CELLS, outward)
-        if is_concrete(closed) and not closed.all():
-            weights, closed, residual = cell_weights(*args, self.neighbors.k, outward)
-        text = (
-            "the neighbours of point {i} do not close its cell, out of {v} of them: mark the "
-            "border of the surface (`boundary`), or choose more neighbours"
-        )
-        weights = refuse(weights, ~closed, text, jnp.sum(self.neighbors.mask, axis=1))
-        weights = _determined(weights, residual, degree)
-        return _summed(weights, self.neighbors.indices.T)
+        return quadrature.areas(self.cloud, self.neighbors, degree, outward)
 
     def integrate(self, u: Float[Array, "n *c"]) -> Float[Array, "*c"]:
         r"""$\int_S u\,dS$ of a field or of each of its components."""
@@ -259,18 +246,8 @@ class Discretization(eqx.Module):
         if points.ndim != 2 or points.shape[1] != self.cloud.dim:
             raise ValueError(f"points have shape {points.shape}, expected (m, {self.cloud.dim})")
         finite(points, "points")
-        centers = nearest_points(self.cloud, points)
-        distance, reach = _distance_and_reach(self.cloud, self.neighbors, points, centers)
-        text = (
-            "points: {i} is {v:.3g} away from the nearest point of the cloud, farther than the "
-            "neighbours of that reach"
-        )
-        points = refuse(points, distance > reach, text, distance)
         degree = self.method.polynomial_degree
-        slots, weights, residual = interpolation_weights(
-            self.cloud, self.neighbors, degree, points, centers
-        )
-        return _interpolated(_determined(weights, residual, degree), slots, u)
+        return interpolated(self.cloud, self.neighbors, degree, points, u)
 
     def _field(self, u) -> Float[Array, "n *c"]:
         u = as_float(u, "field")
@@ -392,48 +369,11 @@ def discretize(
     return Discretization(cloud, neighbors, method, border)
 
 
-def _determined(weights, residual, degree: int):
-    """The weights of local polynomials that the neighbours determine."""
-    text = (
-        f"the neighbours of point {{i}} do not determine a polynomial of degree {degree}: relative "
-        "moment residual {v:.1e}"
-    )
-    return refuse(weights, ~(residual < residual_tolerance(residual.dtype)), text, residual)
-
-
-@jax.jit
-def _distance_and_reach(cloud, neighbors, points, centers):
-    """How far points are from those of the cloud next to them, and how far these's lists reach."""
-    x = jax.lax.stop_gradient(cloud.points)
-    center = x[centers]
-    away = jnp.where(
-        neighbors.mask[centers].T, _length(x[neighbors.indices[centers].T] - center), 0
-    )
-    return _length(jax.lax.stop_gradient(points) - center), jnp.max(away, axis=0)
-
-
-def _length(vectors):
-    return jnp.sqrt(jnp.sum(vectors**2, axis=-1))
-
-
 @copying_jit
 def _first_and_others(weights):
     return weights[:, 0], weights[:, 1:]
 
 
 @jax.jit
-def _summed(weights, indices):
-    return jnp.zeros(weights.shape[1], weights.dtype).at[indices].add(weights)
-
-
-@jax.jit
 def _integral(areas, u):
     return jnp.tensordot(areas, u, 1)
-
-
-@jax.jit
-def _interpolated(weights, slots, u):
-    weights = weights.reshape(*weights.shape, *(1,) * (u.ndim - 1))
-    add = lambda total, slot: (total + slot[0] * u[slot[1]], None)
-    zero = jnp.zeros((slots.shape[1], *u.shape[1:]), jnp.result_type(weights, u))
-    return jax.lax.scan(add, zero, (weights, slots))[0]

@@ -12,31 +12,23 @@ even images for Neumann conditions, odd ones for Dirichlet.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import compress
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from jaxtyping import Array, Float
 
-from .arguments import instance, is_concrete, real
-from .borders import Border, checked_border, find_border
+from .arguments import instance, is_concrete
+from .borders.border import Border, checked_border
+from .borders.order import find_border
 from .boundary import Closure, Source, check_pivots
 from .cloud import PointCloud
 from .conditions import Condition, checked_conditions
+from .images import apart, reach_of, reflected
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod
-
-# An image closer than this share of the spacing to another point is left out (not a half: on a
-# lattice the last bit would decide).
-_CLOSE = 0.49
-# Lengths that differ by less than this share are the same.
-_SAME = 1e-5
 
 
 def with_ghosts(
@@ -105,62 +97,16 @@ def with_ghosts(
     for number, (condition, own) in enumerate(zip(conditions, owned)):
         owner[condition.where[own]], place[condition.where[own]] = number, np.flatnonzero(own)
     with jax.ensure_compile_time_eval():
-        images = _reflected(cloud, border, owner, _reach(cloud, border, method, depth))
+        images = reflected(cloud, border, owner, reach_of(cloud, border, method, depth))
     if not len(images.parent):
         raise ValueError("no border point is under a condition: there is nothing to reflect")
-    images = images.only(_apart(cloud, images), cloud.n)
+    images = images.only(apart(cloud, images), cloud.n)
     bare = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
     bare = bare & (owner < 0)  # remains a border
     rows, indices, weights, sources = _values(cloud, images, conditions, owned, place, throw)
     grown = lambda mask: jnp.asarray(np.pad(mask, (0, len(images.parent)), constant_values=True))
     wide = _joined(cloud, images, grown(bare))
     return wide, Closure(wide.n, rows, indices, weights, sources, grown(declared))
-
-
-@dataclass(frozen=True)
-class _Images:
-    """Images, those of images after their parents.
-
-    Args:
-        points, normals: `(m, d)`.
-        parent: the point that is reflected, n + j for image j, `(m,)`.
-        distance: from the parent to the foot, `(m,)`.
-        condition: number of the condition that holds at the foot, `(m,)`.
-        carriers: border points that carry its values to the foot, `(m, r)`.
-        shares: with which weight, `(m, r)`.
-    """
-
-    points: Float[np.ndarray, "m d"]
-    normals: Float[np.ndarray, "m d"]
-    parent: Int[np.ndarray, " m"]
-    distance: Float[np.ndarray, " m"]
-    condition: Int[np.ndarray, " m"]
-    carriers: Int[np.ndarray, "m r"]
-    shares: Float[np.ndarray, "m r"]
-
-    def only(self, kept, n) -> _Images:
-        """Some of them, parents renumbered."""
-        number = np.concatenate([np.arange(n), n + np.cumsum(kept) - 1])
-        fields = {name: value[kept] for name, value in vars(self).items()}
-        return _Images(**(fields | {"parent": number[fields["parent"]]}))
-
-    def ancestors(self, n):
-        """Which are images of images, of which one, and the point that all began with."""
-        second = self.parent >= n
-        parent = np.where(second, self.parent - n, 0)
-        return second, parent, np.where(second, self.parent[parent], self.parent)
-
-    @classmethod
-    def none(cls, points, r) -> _Images:
-        vectors, number, length = points[:0], np.zeros(0, int), np.zeros(0, points.dtype)
-        return cls(
-            vectors, vectors, number, length, number, number.reshape(0, r), length.reshape(0, r)
-        )
-
-    @classmethod
-    def joined(cls, parts: list[_Images]) -> _Images:
-        columns = zip(*(vars(part).values() for part in parts))
-        return cls(*(np.concatenate(column) for column in columns))
 
 
 def _check_places(conditions, owned, border) -> None:
@@ -172,158 +118,6 @@ def _check_places(conditions, owned, border) -> None:
                 f"condition {number} takes a derivative at point {off[0]}, which is not on the "
                 f"border ({off.size} such points): images need a border"
             )
-
-
-def _reach(cloud, border, method, depth) -> Float[np.ndarray, " m"]:
-    """How deep images reach, for every border point: as far as half its neighbours."""
-    m = len(border.points)
-    if depth is not None:
-        real(depth, "depth", above=0)
-        return np.full(m, float(depth))
-    on = cloud.host_active
-    points = np.asarray(cloud.points, float)
-    half = method.neighbor_count(cloud.dim) / 2
-    count = np.where(np.asarray(border.corners), half / 2, half).astype(int) + 1
-    most = min(int(count.max()), int(on.sum()))
-    distance = cKDTree(points[on]).query(points[np.asarray(border.points)], most)[0]
-    return distance[np.arange(m), np.minimum(count, most) - 1]
-
-
-# --- where images are ----------------------------------------------------------------------
-
-
-def _reflected(cloud, border, owner, reach) -> _Images:
-    """Images across every piece of the border, and next to corners images of images."""
-    on = cloud.host_active
-    names = np.flatnonzero(on)
-    points, normals = np.asarray(cloud.points)[names], np.asarray(cloud.normals)[names]
-    pieces = _pieces(border)
-    across = _Across(cloud, border, owner, reach)
-    first = [across.reflect(piece, names, points, normals) for piece in pieces]
-    start = cloud.n + np.cumsum([0, *(len(images.parent) for images in first)])
-    again = []
-    # Either order leads to the same place at a right angle; one is enough.
-    for i, images in enumerate(first):
-        for j in range(i + 1, len(pieces)):
-            common = np.intersect1d(pieces[i], pieces[j])
-            if common.size:
-                own = start[i] + np.arange(len(images.parent))
-                args = (pieces[j], own, images.points, images.normals)
-                again.append(across.reflect(*args, corners=common))
-    return _Images.joined([*first, *again])
-
-
-@dataclass(frozen=True)
-class _Across:
-    """Reflection across the pieces of a border.
-
-    Args:
-        cloud, border: the surface.
-        owner: number of the condition at each point, −1 for none, `(n,)`.
-        reach: how deep images go, for each border point.
-    """
-
-    cloud: PointCloud
-    border: Border
-    owner: Int[np.ndarray, " n"]
-    reach: Float[np.ndarray, " m"]
-
-    def reflect(self, piece, names, points, normals, *, corners=None) -> _Images:
-        """Images of some points across one piece; with `corners`, of those beyond its ends."""
-        spots = np.asarray(self.border.points)
-        all_points = np.asarray(self.cloud.points)
-        distance, nearest = _nearest(all_points[spots[piece]], points)
-        slot = piece[nearest]
-        near = (distance < (1 - _SAME) * self.reach[slot]) & ~np.isin(names, spots[piece])
-        near &= self.owner[spots[slot]] >= 0
-        if corners is not None:
-            near &= np.isin(slot, corners)
-        names, points, normals, slot = names[near], points[near], normals[near], slot[near]
-        side = _sides(self.border, piece, slot)
-        if not len(slot):
-            return _Images.none(points, self.border.rows.shape[2])
-        # Filled up with copies, so that few shapes are ever compiled.
-        fill = np.arange(max(64, 1 << (len(slot) - 1).bit_length())) % len(slot)
-        found = self.border.at(self.cloud, side[fill], slot[fill], jnp.asarray(points[fill]))
-        foot, _, conormal, share = (np.asarray(x)[: len(slot)] for x in found)
-        inside = -np.einsum("pd,pd->p", points - foot, conormal)
-
-        row, used = (np.asarray(x)[side, slot] for x in (self.border.rows, self.border.mask))
-        end = all_points[spots[slot]]
-        beside = used & (row != spots[slot][:, None])
-        inner = row[np.arange(len(row)), np.argmax(beside, axis=1)]
-        is_end = np.asarray(self.border.corners)[slot]
-        past = np.einsum("pd,pd->p", foot - end, end - all_points[inner])
-        beyond = is_end & (past > np.finfo(points.dtype).eps ** 0.5 / 16 * distance[near])
-        keep = inside > 1e-3 * distance[near]
-        keep &= ~beyond if corners is None else beyond
-
-        # A corner may be under the condition of the other side.
-        speaker = np.where(is_end & (self.owner[inner] >= 0), inner, spots[slot])
-        condition = self.owner[speaker]
-        # Values of another condition say nothing here; one point then speaks alone.
-        shared = np.all(~used | (self.owner[row] == condition[:, None]), axis=1)
-        alone = np.arange(row.shape[1]) == 0
-        carriers = np.where(shared[:, None], row, speaker[:, None])
-        shares = np.where(shared[:, None], share, alone)
-        step = 2 * inside[:, None] * conormal
-        turned = normals - 2 * np.einsum("pd,pd->p", normals, conormal)[:, None] * conormal
-        images = (points + step, turned, names, inside, condition, carriers, shares)
-        return _Images(*(x[keep] for x in images))
-
-
-def _nearest(points, queries) -> tuple[Float[np.ndarray, " q"], Int[np.ndarray, " q"]]:
-    """Distance and number of the nearest point, of several equally near ones the first."""
-    count = min(4, len(points))
-    distance, near = cKDTree(points).query(queries, count)
-    distance, near = distance.reshape(-1, count), near.reshape(-1, count)
-    tied = distance <= (1 + _SAME) * distance[:, :1]
-    return distance[:, 0], np.where(tied, near, len(points)).min(axis=1)
-
-
-def _pieces(border: Border) -> list[Int[np.ndarray, " p"]]:
-    """Places in `border.points` of every smooth piece, the corners at its ends included."""
-    spots, rows = np.asarray(border.points), np.asarray(border.rows)
-    place = np.full(int(spots.max(initial=0)) + int(rows.max(initial=0)) + 1, -1)
-    place[spots] = np.arange(len(spots))
-    corner = np.asarray(border.corners)
-    near = place[rows[0]] if rows.shape[2] > 2 else np.arange(len(spots))[:, None]
-    i = np.broadcast_to(np.arange(len(spots))[:, None], near.shape)
-    inner = ~corner[i] & ~corner[near]
-    graph = coo_array((np.ones(inner.sum()), (i[inner], near[inner])), shape=(len(spots),) * 2)
-    label = connected_components(graph, directed=False)[1]
-    pieces = []
-    for number in np.unique(label[~corner]):
-        members = np.flatnonzero(~corner & (label == number))
-        pieces.append(np.unique(np.concatenate([members, near[members].ravel()])))
-    return pieces
-
-
-def _sides(border: Border, piece, slot) -> Int[np.ndarray, " p"]:
-    """On which side of each slot the piece lies; it matters at corners only."""
-    rows, spots = np.asarray(border.rows), np.asarray(border.points)
-    inner = spots[piece[~np.asarray(border.corners)[piece]]]
-    return np.where(np.isin(rows[0, slot], inner).any(axis=1), 0, 1)
-
-
-def _apart(cloud, images) -> Bool[np.ndarray, " m"]:
-    """Images that are not too close to points, or to images before them."""
-    on = cloud.host_active
-    points = np.asarray(cloud.points, float)[on]
-    tree = cKDTree(points)
-    distance, nearest = tree.query(images.points)
-    spacing = tree.query(points[nearest], 2)[0][:, 1]
-    kept = distance > _CLOSE * spacing
-    pairs = cKDTree(images.points).query_pairs(_CLOSE * float(spacing.max()), output_type="ndarray")
-    gap = np.linalg.norm(images.points[pairs[:, 0]] - images.points[pairs[:, 1]], axis=1)
-    for i, j in pairs[gap < _CLOSE * spacing[pairs[:, 0]]].tolist():
-        kept[max(i, j)] &= not kept[min(i, j)]
-    second = images.parent >= cloud.n
-    kept[second] &= kept[images.parent[second] - cloud.n]
-    return kept
-
-
-# --- their values --------------------------------------------------------------------------
 
 
 def _values(cloud, images, conditions, owned, place, throw):

@@ -8,20 +8,39 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
-from .arguments import is_concrete
-from .build import blocks_of, neighborhood, rows_of
+from .arguments import is_concrete, refuse
+from .build import blocks_of, determined, neighborhood, rows_of
 from .cloud import PointCloud
 from .compiling import sized_jit
+from .fits.moments import blockwise, in_blocks, moment_solve
+from .fits.monomials import monomials
+from .fits.plane import TangentPlane
 from .neighbors import Neighbors, Rows
 from .stencils.method import with_center
-from .stencils.moments import blockwise, in_blocks, moment_solve
-from .stencils.monomials import monomials
-from .stencils.plane import TangentPlane
 
 _BATCH = 128
 
 
-def nearest_points(cloud: PointCloud, points: Float[Array, "m d"]) -> Int[Array, " m"]:
+def interpolated(
+    cloud: PointCloud,
+    neighbors: Neighbors,
+    degree: int,
+    points: Float[Array, "m d"],
+    u: Float[Array, "n *c"],
+) -> Float[Array, "m *c"]:
+    """Values of a field at points of the surface, refused farther away than neighbours reach."""
+    centers = _nearest_points(cloud, points)
+    distance, reach = _distance_and_reach(cloud, neighbors, points, centers)
+    text = (
+        "points: {i} is {v:.3g} away from the nearest point of the cloud, farther than the "
+        "neighbours of that reach"
+    )
+    points = refuse(points, distance > reach, text, distance)
+    slots, weights, residual = _interpolation_weights(cloud, neighbors, degree, points, centers)
+    return _summed(determined(weights, residual, degree), slots, u)
+
+
+def _nearest_points(cloud: PointCloud, points: Float[Array, "m d"]) -> Int[Array, " m"]:
     """The active point of the cloud next to each of these."""
     if is_concrete(cloud.points, cloud.active, points):
         rows = np.flatnonzero(cloud.host_active)
@@ -39,7 +58,7 @@ def _nearest(points, active, wanted):
     return jax.lax.map(nearest, jax.lax.stop_gradient(wanted), batch_size=64).astype(jnp.int32)
 
 
-def interpolation_weights(
+def _interpolation_weights(
     cloud: PointCloud,
     neighbors: Neighbors,
     degree: int,
@@ -69,3 +88,26 @@ def _of_blocks(blocks, offsets, degree: int):
         return jnp.where(around.mask, with_center(eta)[0].at[0].add(1), 0), residual
 
     return blockwise(weights, (blocks, offsets))
+
+
+@jax.jit
+def _distance_and_reach(cloud, neighbors, points, centers):
+    """How far points are from those of the cloud next to them, and how far these's lists reach."""
+    x = jax.lax.stop_gradient(cloud.points)
+    center = x[centers]
+    away = jnp.where(
+        neighbors.mask[centers].T, _length(x[neighbors.indices[centers].T] - center), 0
+    )
+    return _length(jax.lax.stop_gradient(points) - center), jnp.max(away, axis=0)
+
+
+def _length(vectors):
+    return jnp.sqrt(jnp.sum(vectors**2, axis=-1))
+
+
+@jax.jit
+def _summed(weights, slots, u):
+    weights = weights.reshape(*weights.shape, *(1,) * (u.ndim - 1))
+    add = lambda total, slot: (total + slot[0] * u[slot[1]], None)
+    zero = jnp.zeros((slots.shape[1], *u.shape[1:]), jnp.result_type(weights, u))
+    return jax.lax.scan(add, zero, (weights, slots))[0]

@@ -15,10 +15,14 @@ from jaxtyping import Array, Shaped
 
 from jaxsurf.arguments import in_range, instance, is_concrete, raise_at, real, whole
 from jaxsurf.cloud import PointCloud
-from jaxsurf.formats import Contents, contents_of, meshio
-from jaxsurf.frames import estimate_normals
+from jaxsurf.formats.by_suffix import contents_of
+from jaxsurf.formats.contents import Contents
+from jaxsurf.formats.through_meshio import meshio
+from jaxsurf.normals import estimate_normals
+from jaxsurf.shapes.cleaning import clean_mesh, merge_equal
 from jaxsurf.shapes.closest import fit_surface
-from jaxsurf.shapes.meshes import TriangleMesh, clean_mesh, merge_equal, sample_mesh
+from jaxsurf.shapes.meshes import TriangleMesh
+from jaxsurf.shapes.resampling import sample_mesh
 
 # What a cloud carries besides points and normals goes into files under these names.
 _OWN = ("boundary", "active", "spacing")

@@ -7,36 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from .arguments import (
-    as_float,
-    finite,
-    instance,
-    is_array,
-    is_concrete,
-    point_indices,
-    raise_at,
-    real,
-    whole,
-)
-from .checks import (
-    LINK,
-    RINGS,
-    check_count,
-    check_orientation,
-    check_overlap,
-    check_spacing,
-    query,
-    two_sheets,
-)
+from .arguments import as_float, finite, is_array, is_concrete, point_indices, raise_at, real, whole
+from .checks import check_count, check_orientation, check_overlap, check_spacing, two_sheets
 from .cloud import PointCloud
-
-# A way along the surface longer than this times the chord leads around a gap; around a right
-# angle it is at most 1.41.
-_DETOUR = 1.5
+from .sheets import distance_key, judge, nearest, without_islands
 
 
 class Neighbors(eqx.Module):
@@ -225,7 +201,7 @@ def find_neighbors(
         if throw:
             check_overlap(points, normals, tree, slots, above, names=rows)
         if above.any():
-            slots, mask = _without_islands(
+            slots, mask = without_islands(
                 points, normals, tree, slots, mask, above, min_cosine, refill=k is not None
             )
     indices = np.tile(np.arange(cloud.n, dtype=np.int32)[:, None], slots.shape[1])
@@ -237,28 +213,6 @@ def find_neighbors(
         jnp.asarray(accepted),
         None if radius is None else jnp.asarray(radius, cloud.points.dtype),
     )
-
-
-# --- what both searches agree on -----------------------------------------------------------
-
-
-def distance_key(squared: np.ndarray) -> np.ndarray:
-    """Integer that grows with a squared distance and ignores its last bits.
-
-    Distances that are equal up to round-off, as on lattices, get equal keys on every machine,
-    so that the tie is broken by the index, not by the rounding.
-    """
-    if squared.dtype == np.float32:
-        return (squared.view(np.int32) + (1 << 7)) >> 8
-    return (squared.astype(np.float64).view(np.int64) + (1 << 21)) >> 22
-
-
-def cosine_slack(dtype) -> float:
-    """Round-off allowed in the cosine between two normals."""
-    return 64 * float(jnp.finfo(dtype).eps)
-
-
-# --- the two searches on the host ----------------------------------------------------------
 
 
 def nearest_of(
@@ -280,37 +234,12 @@ def nearest_of(
     slots, accepted = nearest(points, normals, tree, k, min_cosine, rows=place)
     above = two_sheets(points, normals, slots, place)
     if above.any():
-        slots, accepted = _without_islands(
+        slots, accepted = without_islands(
             points, normals, tree, slots, accepted, above, min_cosine, rows=place
         )
     indices, mask = np.tile(rows[:, None].astype(np.int32), k), np.zeros((len(rows), k), bool)
     indices[wanted], mask[wanted] = names[slots], accepted
     return indices, mask
-
-
-def nearest(points, normals, tree, k: int, min_cosine: float, *, rows=None):
-    """The k nearest acceptable points of each (of `rows`), from as many candidates as it takes."""
-    n = len(points)
-    rows = np.arange(n) if rows is None else rows
-    slots = np.tile(rows[:, None], k)
-    mask = np.zeros(slots.shape, bool)
-    todo = np.arange(len(rows))
-    count = min(n, k + 4)
-    most = min(n, max(8 * k, 64))
-    while todo.size:
-        centre = rows[todo]
-        found = query(tree, points[centre], count)
-        key, accepted = _judge(points, normals, centre[:, None], found, min_cosine)
-        # Beyond the farthest candidate there may be others at the same distance.
-        sure = np.sum(accepted & (key < key.max(axis=1, keepdims=True)), axis=1) >= k
-        done = sure | (count == most)
-        order = np.lexsort((found, np.where(accepted, key, np.iinfo(key.dtype).max)), axis=1)
-        order = order[done, :k]
-        mask[todo[done]] = np.take_along_axis(accepted[done], order, axis=1)
-        slots[todo[done]] = np.take_along_axis(found[done], order, axis=1)
-        todo = todo[~done]
-        count = min(most, 2 * count)
-    return np.where(mask, slots, rows[:, None]), mask
 
 
 def _within(points, normals, tree, radius, capacity, min_cosine: float, names):
@@ -319,7 +248,7 @@ def _within(points, normals, tree, radius, capacity, min_cosine: float, names):
     far = float(radius.max()) * (1 + 1e-6)  # the last bits are judged below
     pairs = tree.query_pairs(far, output_type="ndarray")
     row, found = np.concatenate([pairs, pairs[:, ::-1], np.tile(np.arange(n)[:, None], 2)]).T
-    key, accepted = _judge(points, normals, row, found, min_cosine)
+    key, accepted = judge(points, normals, row, found, min_cosine)
     near = key <= distance_key(radius * radius)[row]
     lone = np.flatnonzero(np.bincount(row[near], minlength=n) < 2)
     if lone.size:
@@ -344,105 +273,3 @@ def _within(points, normals, tree, radius, capacity, min_cosine: float, names):
     mask = np.arange(width) < count[:, None]
     slots[mask] = found
     return slots, mask
-
-
-def _without_islands(
-    points, normals, tree, slots, mask, above, min_cosine: float, *, rows=None, refill=True
-):
-    """Take out what lies across a gap, on another sheet of the same orientation.
-
-    Only rows that hold a point `above` their own are changed. They keep what a short way over
-    the surface leads to, and are refilled from twice as many candidates.
-    """
-    rows = np.arange(len(points)) if rows is None else rows
-    held = np.flatnonzero(above.any(axis=1))
-    slots, mask = slots.copy(), mask.copy()
-    wide, admitted, k = slots[held], mask[held], slots.shape[1]
-    if refill:
-        most = min(len(points), 2 * k)
-        wide, admitted = nearest(points, normals, tree, most, min_cosine, rows=rows[held])
-    members = np.unique(wide)
-    links = _links(points, normals, tree, members, min_cosine)
-    for i, candidates, good in zip(held, wide, admitted, strict=True):
-        found = candidates[good]
-        place = np.searchsorted(members, found)
-        way = dijkstra(links[place][:, place], directed=False, indices=0)
-        chord = np.linalg.norm(points[found] - points[rows[i]], axis=1)
-        kept = found[way <= _DETOUR * chord][:k]
-        slots[i], mask[i] = rows[i], np.arange(k) < kept.size
-        slots[i, : kept.size] = kept
-    return slots, mask
-
-
-def _links(points, normals, tree, members, min_cosine: float) -> csr_array:
-    """Lengths of the steps over the surface between members that are close to each other."""
-    count = min(len(points), 2 * RINGS)
-    near, used = nearest(points, normals, tree, count, min_cosine, rows=members)
-    d = points[near] - points[members][:, None]
-    length = np.linalg.norm(d, axis=2)
-    # A chord of a smooth curve makes equal angles with the normals at its ends.
-    both = normals[near] + normals[members][:, None]
-    along = np.abs(np.einsum("nkd,nkd->nk", d, both)) <= 0.5 * length * np.linalg.norm(both, axis=2)
-    place = np.minimum(np.searchsorted(members, near), len(members) - 1)
-    reach = LINK * length[:, [min(_ring_size(points), count) - 1]]
-    step = used & along & (members[place] == near) & (length > 0) & (length <= reach)
-    entries = (length[step], (np.nonzero(step)[0], place[step]))
-    return csr_array(entries, shape=(len(members), len(members)))
-
-
-def _ring_size(points: np.ndarray) -> int:
-    """A point and its closest neighbours: two of a curve, four of a surface."""
-    return 2 * points.shape[1] - 1
-
-
-def _judge(points, normals, row, found, min_cosine: float):
-    """Distance key of each candidate, and whether its normal lets it in."""
-    d = points[found] - points[row]
-    key = distance_key(np.einsum("...d,...d->...", d, d))
-    cosine = np.einsum("...d,...d->...", normals[found], normals[row])
-    return key, cosine >= min_cosine - cosine_slack(points.dtype)
-
-
-def tube_ratio(cloud: PointCloud, neighbors: Neighbors) -> Float[Array, " n"]:
-    r"""Largest normal curvature that each point sees among its neighbours.
-
-    $\max_j |(x_j-x_i)\cdot(n_j-n_i)|\,/\,|x_j-x_i|^2$. Times the radius of the support it says
-    how far the surface bends within one stencil: above 1 the lines along the normals meet
-    within the support, and points copied along them land among each other.
-
-    Args:
-        cloud: n points with unit normals.
-        neighbors: which points to compare with.
-
-    Returns:
-        One number per point, `(n,)`, in 1 / length; 0 for a point without neighbours.
-
-    Differentiable: forward and reverse, in points and normals, for fixed neighbours.
-
-    Example:
-        >>> angle = 2 * jnp.pi * jnp.arange(50) / 50
-        >>> circle = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
-        >>> cloud = js.PointCloud(2 * circle, circle)
-        >>> float(js.tube_ratio(cloud, js.find_neighbors(cloud, k=5)).max().round(6))
-        0.5
-    """
-
-    instance(cloud, PointCloud, "cloud")
-    instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
-    if neighbors.n != cloud.n:
-        raise ValueError(f"neighbors of {neighbors.n} points, the cloud has {cloud.n}")
-    return _bend(cloud.points, cloud.normals, neighbors.indices.T, neighbors.mask.T)
-
-
-@jax.jit
-def _bend(points, normals, slots, masks):
-    # One column of neighbours at a time: nothing of size (n, k, d) is stored.
-    def bend(column):
-        slot, mask = column
-        d = points[slot] - points
-        squared = jnp.sum(d * d, axis=1)
-        used = mask & (squared > 0)
-        turn = jnp.sum(d * (normals[slot] - normals), axis=1)
-        return jnp.where(used, jnp.abs(turn) / jnp.where(used, squared, 1), 0)
-
-    return jnp.max(jax.lax.map(bend, (slots, masks)), axis=0)

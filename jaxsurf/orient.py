@@ -7,7 +7,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
-from .neighbors import check_orientation
+from .checks import check_orientation
 
 # Neighbours used for the first guess: one ring and a half, so that thin parts stay apart.
 _NEAR = {2: 5, 3: 13}

@@ -5,7 +5,7 @@ plane of its point a cell is a polygon, whose sides are slightly curved; with th
 over that plane, fitted to the neighbours, the moments of the cell are found by Gauss's rule.
 A function is integrated over a cell as its local polynomial is: from these moments come weights of
 all neighbours, exactly as those of a derivative come from its values on monomials
-(`stencils/moments.py`). Their sums over all cells integrate over the surface.
+(`fits/moments.py`). Their sums over all cells integrate over the surface.
 """
 
 from __future__ import annotations
@@ -20,19 +20,46 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Bool, Float
 
-from .build import blocks_of, neighborhood, rows_of
+from .arguments import is_concrete, refuse
+from .build import blocks_of, determined, neighborhood, rows_of
 from .cloud import PointCloud
 from .compiling import sized_jit
+from .fits.moments import blockwise, in_blocks, moment_solve
+from .fits.monomials import differentiation, monomials_by_degree, polynomial_count
+from .fits.plane import TangentPlane
 from .neighbors import Neighbors
 from .stencils.method import with_center
-from .stencils.moments import blockwise, in_blocks, moment_solve
-from .stencils.monomials import differentiation, monomials_by_degree, polynomial_count
-from .stencils.plane import TangentPlane
 
 _BATCH = 128
 # Newton steps from cells with straight sides to those on the surface: each squares what is left of
 # an error of the size (spacing x curvature)^2.
 _STEPS = 2
+# So many neighbours may bound a cell; where points are very uneven, all are tried.
+_CELLS = 24
+
+
+def areas(
+    cloud: PointCloud,
+    neighbors: Neighbors,
+    degree: int,
+    outward: Float[Array, "n d"] | None,
+) -> Float[Array, " n"]:
+    """Weights of the points in integrals over the surface; arguments as of `cell_weights`."""
+    args = (cloud, neighbors, degree)
+    weights, closed, residual = cell_weights(*args, _CELLS, outward)
+    if is_concrete(closed) and not closed.all():
+        weights, closed, residual = cell_weights(*args, neighbors.k, outward)
+    text = (
+        "the neighbours of point {i} do not close its cell, out of {v} of them: mark the "
+        "border of the surface (`boundary`), or choose more neighbours"
+    )
+    weights = refuse(weights, ~closed, text, jnp.sum(neighbors.mask, axis=1))
+    return _summed(determined(weights, residual, degree), neighbors.indices.T)
+
+
+@jax.jit
+def _summed(weights, indices):
+    return jnp.zeros(weights.shape[1], weights.dtype).at[indices].add(weights)
 
 
 def cell_weights(
@@ -73,7 +100,7 @@ def _surfaces(blocks, degree: int):
 
     def fit(block):
         plane = TangentPlane.of(neighborhood(block), degree)
-        return plane, Graph(plane.surface(degree), degree, len(plane.points))
+        return plane, Graph(plane.surface(1, degree)[0], degree, len(plane.points))
 
     return blockwise(fit, blocks)
 

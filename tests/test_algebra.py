@@ -85,7 +85,7 @@ def test_what_is_known_of_parts_is_known_of_the_whole():
     np.testing.assert_allclose((L.T + F).diagonal, np.diag(dense) + F, rtol=1e-12)
     np.testing.assert_allclose((F * (BACKWARDS - 1)).diagonal, F * (np.diag(dense) - 1), rtol=1e-12)
     with pytest.raises(ValueError, match="diagonal of a Composition"):
-        (L @ L).diagonal
+        _ = (L @ L).diagonal
     marked = js.Stencil(L.indices, L.weights, border=jnp.arange(CLOUD.n) < 3)
     for operator in (marked + L, marked.T, F + marked @ L, L - 2 * marked):
         assert int(operator.border.sum()) == 3

@@ -12,7 +12,8 @@ import pytest
 import jaxsurf as js
 from jaxsurf import demo
 from jaxsurf.cli import main
-from jaxsurf.formats import contents_of
+from jaxsurf.formats.by_suffix import contents_of
+from jaxsurf.heat import cell_areas
 
 _DATA = Path("../shared/data")
 
@@ -113,7 +114,7 @@ def test_surface_from_file(tmp_path):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_cell_areas(dim):
     cloud = js.sphere(2_000) if dim == 3 else js.circle(200)
-    areas = demo.cell_areas(cloud, js.find_neighbors(cloud, k=20 if dim == 3 else 7))
+    areas = cell_areas(cloud, js.find_neighbors(cloud, k=20 if dim == 3 else 7))
     measure = 4 * np.pi if dim == 3 else 2 * np.pi
     assert abs(float(areas.sum()) / measure - 1) < 2e-3
     assert float(jnp.std(areas) / jnp.mean(areas)) < 0.02

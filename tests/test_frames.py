@@ -11,8 +11,9 @@ import pytest
 
 import jaxsurf as js
 from jaxsurf.cloud import PointCloud
-from jaxsurf.frames import estimate_normals, from_points, refit_normals, tangent_frames
+from jaxsurf.frames import tangent_frames
 from jaxsurf.neighbors import Neighbors, find_neighbors
+from jaxsurf.normals import estimate_normals, from_points, refit_normals
 
 from .helpers import check_derivative
 

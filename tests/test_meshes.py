@@ -6,9 +6,11 @@ import pytest
 from scipy.spatial import ConvexHull, cKDTree
 
 from jaxsurf.io import read
+from jaxsurf.shapes.cleaning import clean_mesh
 from jaxsurf.shapes.closest import ClosestPoint, fit_surface
-from jaxsurf.shapes.meshes import TriangleMesh, clean_mesh, sample_mesh
-from jaxsurf.shapes.sampling import measure_quality
+from jaxsurf.shapes.meshes import TriangleMesh
+from jaxsurf.shapes.resampling import sample_mesh
+from jaxsurf.shapes.spacing import measure_quality
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
 

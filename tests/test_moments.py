@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsurf.stencils.kernels import gaussian, support, taper
-from jaxsurf.stencils.moments import blockwise, in_blocks, moment_solve, out_of_blocks
-from jaxsurf.stencils.monomials import differentiation, monomials, multi_indices
+from jaxsurf.fits.kernels import gaussian, support, taper
+from jaxsurf.fits.moments import blockwise, in_blocks, moment_solve, out_of_blocks
+from jaxsurf.fits.monomials import differentiation, monomials, multi_indices
 from jaxsurf.stencils.targets import Gradient, Hessian, Laplacian, Partial
 
 from .helpers import check_derivative

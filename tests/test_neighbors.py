@@ -12,8 +12,10 @@ from scipy.spatial import cKDTree
 from jaxsurf.cells import SearchCapacity, allocate, search_neighbors
 from jaxsurf.checks import two_sheets
 from jaxsurf.cloud import PointCloud
+from jaxsurf.curvature import tube_ratio
 from jaxsurf.io import read
-from jaxsurf.neighbors import find_neighbors, nearest, nearest_of, tube_ratio
+from jaxsurf.neighbors import find_neighbors, nearest_of
+from jaxsurf.sheets import nearest
 
 ARMADILLO = Path(__file__).parents[2] / "shared" / "data" / "armadillo.obj"
 

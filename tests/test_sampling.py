@@ -11,15 +11,9 @@ from scipy.spatial import cKDTree
 from jaxsurf.cloud import PointCloud
 from jaxsurf.shapes.analytic import sphere, sphere_projection
 from jaxsurf.shapes.order import sort_cloud, sort_points
-from jaxsurf.shapes.sampling import (
-    ideal_spacing,
-    jitter,
-    measure_quality,
-    poisson_disk,
-    quasi_uniform,
-    relax,
-    thin,
-)
+from jaxsurf.shapes.sampling import jitter, quasi_uniform, relax
+from jaxsurf.shapes.spacing import ideal_spacing, measure_quality
+from jaxsurf.shapes.thinning import poisson_disk, thin
 
 SPHERE = 4 * np.pi
 

@@ -9,21 +9,15 @@ from jaxsurf.shapes.analytic import (
     circle,
     ellipsoid,
     ellipsoid_projection,
-    graph,
     sphere,
     sphere_projection,
-    surface_of_revolution,
     torus,
     torus_projection,
 )
-from jaxsurf.shapes.implicit import (
-    double_torus,
-    level_set,
-    level_set_curvature,
-    level_set_normals,
-    project_to_level_set,
-)
-from jaxsurf.shapes.sampling import ideal_spacing, measure_quality
+from jaxsurf.shapes.implicit import level_set_curvature, level_set_normals, project_to_level_set
+from jaxsurf.shapes.level_sets import double_torus, level_set
+from jaxsurf.shapes.parametric import graph, surface_of_revolution
+from jaxsurf.shapes.spacing import ideal_spacing, measure_quality
 
 from .helpers import check_derivative, count_compilations
 

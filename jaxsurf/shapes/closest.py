@@ -9,8 +9,13 @@ from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from scipy.spatial import cKDTree
 
+from jaxsurf.fits.monomials import polynomial_count
+from jaxsurf.fits.plane import TangentPlane, dot
+
 # Cosine of the largest angle between a fitted normal and that of the mesh: 35 degrees.
 _MOST_TURN = 0.82
+# Of the normal equations of a fit: the vertices determine it where their condition is below.
+_WORST = 1e10
 
 
 class ClosestPoint:
@@ -157,36 +162,17 @@ def fit_surface(
 
 
 def _fit_once(points, normals, tree, vertices, vertex_normals, degree):
-    size = math.comb(degree + 2, 2)
+    size = polynomial_count(2, degree)
     k = min(2 * size + 4, tree.n)
     far, index = tree.query(points, k=range(1, k + 1))
-    tangent, other = _tangents(normals)
-    offset = vertices[index] - points[:, None]
-    radius = far[:, -1:]
-    x = np.einsum("qkd,qd->qk", offset, tangent) / radius
-    y = np.einsum("qkd,qd->qk", offset, other) / radius
-    z = np.einsum("qkd,qd->qk", offset, normals) / radius
-    same = np.einsum("qkd,qd->qk", vertex_normals[index], normals) > 0.25
-    weight = np.where(same, np.exp(-2.5 * (x**2 + y**2 + z**2)), 0)
-    powers = [(i - j, j) for i in range(degree + 1) for j in range(i + 1)]
-    basis = np.stack([x**i * y**j for i, j in powers], axis=-1)
-    enough = same.sum(axis=1) >= size + 2
-    q, r = np.linalg.qr(basis * weight[..., None])
-    diagonal = np.abs(np.diagonal(r, axis1=1, axis2=2))
-    enough &= diagonal.min(axis=1) > 1e-5 * diagonal.max(axis=1)
-    r[~enough] = np.eye(size)
-    rhs = np.einsum("qki,qk->qi", q, z * weight)
-    c = np.linalg.solve(r, rhs[..., None])[..., 0]
+    slots, radius, normals = index.T, far[:, -1], normals.T
+    offsets = np.stack([v[slots] - x for v, x in zip(vertices.T, points.T)], axis=1)
+    same = sum(v[slots] * n for v, n in zip(vertex_normals.T, normals)) > 0.25
+    weights = np.where(same, np.exp(-5 * dot(offsets, offsets) / radius**2), 0)
+    plane = TangentPlane.at(normals, offsets, weights, radius, radius)
+    c, condition = plane.surface(0, degree)
     # A fit that lifts a point by more than the distance between vertices is no fit.
-    enough &= np.abs(c[:, 0]) < 1 / math.sqrt(k)
-    c[~enough] = 0
-    new = points + c[:, :1] * radius * normals
-    normal = normals - c[:, 1:2] * tangent - c[:, 2:3] * other
-    return new, normal / np.linalg.norm(normal, axis=1, keepdims=True), enough
-
-
-def _tangents(normals):
-    axis = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
-    tangent = np.cross(normals, axis)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    return tangent, np.cross(normals, tangent)
+    enough = (same.sum(axis=0) >= size + 2) & (condition < _WORST)
+    enough &= np.abs(c[0]) < 1 / math.sqrt(k)
+    c = np.where(enough, c, 0)
+    return points + (c[0] * radius * normals).T, plane.tilted(normals, c[1:3]).T, enough

@@ -1,24 +1,17 @@
-"""Triangle meshes on the host: what they are made of, how they are cleaned and resampled."""
+"""Triangle meshes on the host: what they are made of."""
 
 from __future__ import annotations
 
-import math
-import warnings
 from dataclasses import dataclass
 from functools import cached_property
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from jaxsurf.arguments import in_range, instance, on_host, raise_at, real, whole
-from jaxsurf.cloud import PointCloud
-from jaxsurf.shapes.closest import ClosestPoint, fit_surface
-from jaxsurf.shapes.order import sort_cloud
-from jaxsurf.shapes.sampling import MOST, ideal_spacing, points_at, quasi_uniform
+from jaxsurf.arguments import in_range, on_host, raise_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +42,12 @@ class TriangleMesh:
 
     def __post_init__(self):
         object.__setattr__(self, "vertices", on_host(self.vertices, "vertices"))
-        object.__setattr__(self, "triangles", _vertex_numbers(self.triangles))
-        _check_arrays(self.vertices, self.triangles)
+        object.__setattr__(self, "triangles", vertex_numbers(self.triangles))
+        check_arrays(self.vertices, self.triangles)
         t = self.triangles
         twice = (t[:, 0] == t[:, 1]) | (t[:, 1] == t[:, 2]) | (t[:, 2] == t[:, 0])
         raise_at(twice, "triangle {i} names a vertex twice: {v}", t)
-        _check_manifold(self.edge_table)
+        check_manifold(self.edge_table)
         turned = np.flatnonzero((self.edge_table.faces[:, 1] >= 0) & ~self.edge_table.consistent)
         if turned.size:
             a, b = self.edge_table.faces[turned[0]]
@@ -143,7 +136,7 @@ class TriangleMesh:
     def components(self) -> Int[Array, " m"]:
         """Number of the connected piece that each triangle belongs to, from 0."""
         inner = self.edge_table.faces[self.edge_table.faces[:, 1] >= 0]
-        return csgraph.connected_components(_graph(inner, len(self.triangles)), directed=False)[1]
+        return csgraph.connected_components(graph_of(inner, len(self.triangles)), directed=False)[1]
 
     @property
     def genus(self) -> int:
@@ -215,222 +208,14 @@ class EdgeTable:
         return EdgeTable(ends, faces, count, paired & (start[one] != start[two]))
 
 
-def clean_mesh(
-    vertices: Float[Array, "n 3"],
-    triangles: Int[Array, "m 3"],
-    *,
-    name: str = "mesh",
-    stacklevel: int = 2,
-    largest_part: bool = False,
-) -> tuple[TriangleMesh, Int[Array, " kept"]]:
-    """Mesh from raw arrays, every repair stated in a warning.
-
-    Vertices at exactly equal positions become one, triangles that then name a vertex twice
-    are dropped, so are vertices that no triangle uses, and triangles that are turned the
-    wrong way round are turned back (as few as possible in each connected piece).
-
-    Args:
-        vertices: positions, `(n, 3)`.
-        triangles: vertex numbers from 0, `(m, 3)`.
-        name: what to call the mesh in warnings and errors.
-        stacklevel: of the warnings, as in `warnings.warn`.
-        largest_part: where edges have more than two triangles, as where a fin stands on a
-            surface, cut the triangles apart there and keep the pieces, from the one with the
-            largest area on, that leave no edge with more than two; the others are dropped.
-
-    Returns:
-        The mesh, and for each of its vertices the row of `vertices` that it was.
-
-    Raises:
-        ValueError: as `TriangleMesh`; no triangle left; not orientable (a Möbius band).
-        TypeError: arrays of other kinds.
-
-    Example:
-        >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-        >>> triangles = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
-        >>> mesh, kept = js.clean_mesh(corners, triangles)
-        >>> mesh.closed, kept.tolist()
-        (True, [0, 1, 2, 3])
-    """
-    vertices, triangles = on_host(vertices, "vertices"), _vertex_numbers(triangles)
-    try:
-        _check_arrays(vertices, triangles)
-        first, inverse = merge_equal(vertices)
-        merged = len(vertices) - len(first)
-        triangles = inverse[triangles]
-        a, b, c = triangles.T
-        collapsed = (a == b) | (b == c) | (c == a)
-        triangles = triangles[~collapsed]
-        if not len(triangles):
-            raise ValueError("no triangles")
-        chosen = np.ones(len(triangles), bool)
-        if largest_part:
-            chosen = _largest_part(vertices, triangles)
-            triangles = triangles[chosen]
-        used, triangles = np.unique(triangles, return_inverse=True)
-        triangles = triangles.reshape(-1, 3)
-        unused = np.setdiff1d(np.arange(len(first)), used)
-        kept = first[used]
-        _check_manifold(EdgeTable.of(triangles, len(used)))
-        flip = _faces_to_flip(triangles, len(used))
-        triangles[flip] = triangles[flip][:, ::-1]
-        mesh = TriangleMesh(vertices[kept], triangles)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from None
-    for count, text in (
-        (merged, "{} vertices at exactly the position of another merged with it"),
-        (collapsed.sum(), "{} triangles without area (a vertex named twice) dropped"),
-        (unused.size, f"{{}} vertices belong to no triangle, dropped (first: {first[unused[:1]]})"),
-        (flip.sum(), "{} triangles turned round to agree with their neighbours"),
-        ((~chosen).sum(), "{} triangles dropped, so that no edge has more than two"),
-    ):
-        if count:
-            warnings.warn(f"{name}: " + text.format(count), stacklevel=stacklevel)
-    return mesh, kept
-
-
-def sample_mesh(
-    mesh: TriangleMesh,
-    *,
-    n: int | None = None,
-    spacing: float | None = None,
-    smooth: bool = True,
-    degree: int = 4,
-    seed: int = 0,
-) -> PointCloud:
-    r"""Quasi-uniform points on a triangle mesh, as many as asked for or that far apart.
-
-    Borders are resampled first, along their length; then points spread over the triangles are
-    thinned and relaxed between them. The flat triangles of a mesh are only second-order close
-    to the surface it stands for, so the points are then moved onto local polynomial fits of
-    the vertices, which also give the normals.
-
-    Args:
-        mesh: the surface, closed or with borders.
-        n: number of points.
-        spacing: distance h between neighbours, instead of n: $n = \text{area} / h^2$.
-        smooth: fit polynomials; if False, the points stay on the triangles with normals
-            carried over from the vertices: right for surfaces with sharp edges.
-        degree: of the polynomials.
-        seed: of the random candidates.
-
-    Returns:
-        A cloud sorted along a space-filling curve; `boundary` flags the points on borders.
-
-    Accuracy: distance to the smooth surface O(edge²) on the triangles, and of fourth or higher
-        order with `degree=4` (`tests/test_meshes.py::test_distance_to_the_smooth_surface`).
-
-    Raises:
-        ValueError: not exactly one of n and spacing; too few points or vertices (both numbers
-            given).
-
-    Example:
-        >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]])
-        >>> mesh = js.TriangleMesh(corners, np.array([[0, 1, 2]]))
-        >>> cloud = js.sample_mesh(mesh, n=200, smooth=False)
-        >>> cloud.n, bool(jnp.all(cloud.normals == jnp.array([0.0, 0.0, 1.0])))
-        (200, True)
-    """
-    instance(mesh, TriangleMesh, "mesh", "js.clean_mesh(vertices, triangles) makes one")
-    whole(degree, "degree", least=1)
-    whole(seed, "seed", least=0)
-    instance(smooth, (bool, np.bool_), "smooth")
-    n, h = _how_many(mesh.area, n, spacing)
-    need = math.comb(degree + 2, 2) + 2
-    if smooth and len(mesh.vertices) < need:
-        raise ValueError(
-            f"the mesh has {len(mesh.vertices)} vertices, a smooth fit of degree {degree} needs"
-            f" at least {need}: lower the degree or take smooth=False"
-        )
-    closest = ClosestPoint(mesh.vertices, mesh.triangles)
-
-    def project(points, exact=False):
-        place, triangle, bary = closest(points, exact=exact)
-        return place, mesh.normals_at(triangle, bary)
-
-    candidates, candidate_normals = _spread(mesh, 8 * n, seed)
-    border = _border_points(mesh, h)
-    points, _ = quasi_uniform(
-        candidates,
-        n,
-        project,
-        measure=mesh.area,
-        normals=candidate_normals,
-        fixed=project(border, exact=True) if len(border) else None,
-        seed=seed,
-    )
-    points, normals = project(points, exact=True)
-    if smooth:
-        points, normals, used = fit_surface(
-            points,
-            normals,
-            vertices=mesh.vertices,
-            vertex_normals=mesh.vertex_normals,
-            degree=degree,
-        )
-        low = np.flatnonzero(used < degree)
-        if low.size:
-            warnings.warn(
-                f"the vertices near {low.size} of {n} points allow no fit of degree {degree}; the"
-                f" lowest degree used is {used.min()} (0: left on the triangle)",
-                stacklevel=2,
-            )
-    boundary = None if mesh.closed else jnp.arange(n) < len(border)
-    cloud = PointCloud(jnp.asarray(points), jnp.asarray(normals), boundary=boundary)
-    return sort_cloud(cloud)[0]
-
-
-def _how_many(area: float, n: int | None, spacing: float | None) -> tuple[int, float]:
-    if (n is None) == (spacing is None):
-        raise ValueError(f"give one of n and spacing, not n = {n} and spacing = {spacing}")
-    if n is None:
-        n = points_at(real(spacing, "spacing", above=0), area)
-    if whole(n, "n", most=MOST) < 10:
-        raise ValueError(f"n = {n} points on a surface of area {area:.3g}, expected at least 10")
-    return n, ideal_spacing(area, n)
-
-
-def _spread(mesh: TriangleMesh, m: int, seed: int):
-    """m points spread evenly by area over the triangles, and normals."""
-    rng = np.random.default_rng(seed)
-    end = np.cumsum(mesh.areas)
-    where = (np.arange(m) + rng.random(m)) / m * end[-1]
-    triangle = np.minimum(np.searchsorted(end, where), len(end) - 1)
-    u, v = np.sqrt(rng.random(m)), rng.random(m)
-    bary = np.stack([1 - u, u * (1 - v), u * v], axis=1)
-    points = np.einsum("qi,qij->qj", bary, mesh.vertices[mesh.triangles[triangle]])
-    return points, mesh.normals_at(triangle, bary)
-
-
-def _border_points(mesh: TriangleMesh, spacing: float) -> Float[Array, "b 3"]:
-    """Points about `spacing` apart along every border long enough to be seen at that spacing."""
-    found, lost = [np.empty((0, 3))], 0
-    for loop in mesh.border_loops:
-        corner = mesh.vertices[np.append(loop, loop[0])]
-        length = np.append(0, np.cumsum(np.linalg.norm(np.diff(corner, axis=0), axis=1)))
-        count = round(length[-1] / spacing)
-        if count < 4:
-            lost += 1
-            continue
-        at = np.arange(count) / count * length[-1]
-        found.append(np.stack([np.interp(at, length, x) for x in corner.T], axis=1))
-    if lost:
-        warnings.warn(
-            f"{lost} of {len(mesh.border_loops)} holes are shorter round than 4 spacings of"
-            f" {spacing:.3g} and are not marked as boundary",
-            stacklevel=3,
-        )
-    return np.concatenate(found)
-
-
-def _vertex_numbers(triangles) -> Int[Array, "..."]:
+def vertex_numbers(triangles) -> Int[Array, "..."]:
     numbers = on_host(triangles, "triangles")
     if not (np.isfinite(numbers) & (numbers == np.rint(numbers))).all():
         raise ValueError("triangles must hold whole numbers of vertices")
     return numbers.astype(np.int64)
 
 
-def _check_arrays(vertices, triangles):
+def check_arrays(vertices, triangles):
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise ValueError(f"vertices must have shape (n, 3), not {vertices.shape}")
     if triangles.ndim != 2 or triangles.shape[1] != 3:
@@ -442,7 +227,7 @@ def _check_arrays(vertices, triangles):
     raise_at(outside, text, triangles)
 
 
-def _check_manifold(table: EdgeTable):
+def check_manifold(table: EdgeTable):
     many = np.flatnonzero(table.count > 2)
     if many.size:
         i, j = table.ends[many[0]]
@@ -453,69 +238,5 @@ def _check_manifold(table: EdgeTable):
         )
 
 
-def _largest_part(vertices, triangles) -> Bool[Array, " m"]:
-    """Which triangles stay, so that no edge has more than two."""
-    table = EdgeTable.of(triangles, len(vertices))
-    if table.count.max() <= 2:
-        return np.ones(len(triangles), bool)
-    inner = table.faces[table.count == 2]
-    label = csgraph.connected_components(_graph(inner, len(triangles)), directed=False)[1]
-    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
-    area = np.bincount(label, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
-    # Which piece has how many triangles at which of the edges that too many share.
-    ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1), axis=-1)
-    key = ends[..., 0] * len(vertices) + ends[..., 1]
-    wide = table.ends[table.count > 2] @ [len(vertices), 1]
-    at, edge = np.nonzero(np.isin(key, wide))
-    held = sparse.coo_array(
-        (np.ones(len(at)), (label[at], np.searchsorted(wide, key[at, edge]))),
-        shape=(len(area), len(wide)),
-    ).tocsr()
-    load, kept = np.zeros(len(wide)), np.zeros(len(area), bool)
-    # Areas that are equal up to round-off in the order of the file.
-    for piece in np.argsort(-(area / area.max()).round(9), kind="stable"):
-        more = held[[piece]].toarray()[0]
-        if (load + more <= 2).all():
-            load, kept[piece] = load + more, True
-    return kept[label]
-
-
-def merge_equal(points: Float[Array, "n d"]) -> tuple[Int[Array, " u"], Int[Array, " n"]]:
-    """First row of every distinct point, in order of appearance, and each row's place there."""
-    order = np.lexsort(points.T)  # stable, so equal rows stay in order of appearance
-    new = np.ones(len(points), bool)
-    new[1:] = (points[order[1:]] != points[order[:-1]]).any(axis=1)
-    first = np.empty(len(points), np.int64)
-    first[order] = order[new][np.cumsum(new) - 1]
-    kept = np.unique(first)
-    return kept, np.searchsorted(kept, first)
-
-
-def _faces_to_flip(triangles: Int[Array, "m 3"], n: int) -> Bool[Array, " m"]:
-    # Two sheets, one for each orientation of every triangle: an edge links equal sheets where
-    # its triangles agree and opposite sheets where they do not. A piece is orientable exactly
-    # if its two sheets stay apart.
-    m, table = len(triangles), EdgeTable.of(triangles, n)
-    inner = table.faces[:, 1] >= 0
-    (a, b), agree = table.faces[inner].T, table.consistent[inner]
-    links = np.concatenate(
-        [
-            np.stack([a, np.where(agree, b, b + m)], axis=1),
-            np.stack([a + m, np.where(agree, b + m, b)], axis=1),
-        ]
-    )
-    sheets = csgraph.connected_components(_graph(links, 2 * m), directed=False)[1]
-    as_given, turned = sheets[:m], sheets[m:]
-    bad = np.flatnonzero(as_given == turned)
-    if bad.size:
-        raise ValueError(
-            "the surface has only one side (a Möbius band or worse): no orientation of the"
-            f" {bad.size} triangles joined to triangle {bad[0]} is consistent"
-        )
-    votes = np.bincount(as_given, minlength=sheets.max() + 1)
-    tie = (votes[as_given] == votes[turned]) & (as_given > turned)
-    return (votes[as_given] < votes[turned]) | tie
-
-
-def _graph(links: Int[Array, "e 2"], n: int) -> sparse.coo_array:
+def graph_of(links: Int[Array, "e 2"], n: int) -> sparse.coo_array:
     return sparse.coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))

@@ -112,11 +112,11 @@ def solve(
     given, rtol = rtol is not None, tolerance(rtol, rhs.dtype)
     whole(max_steps, "max_steps", least=1)
     concrete = is_concrete(*jax.tree.leaves((operator, rhs, conditions, preconditioner)))
-    known = without_derivatives((operator, conditions))
+    plain, closure = without_derivatives((operator, conditions))
     if preconditioner is None:
-        preconditioner = multigrid(known[0], conditions=known[1])
+        preconditioner = multigrid(plain, conditions=closure)
     if mean_zero is None:
-        mean_zero = _is_mean_zero(*known, preconditioner)
+        mean_zero = _is_mean_zero(plain, closure, preconditioner)
     if solver is None:
         solver = BiCGStab(rtol, float(atol), np.asarray(max_steps))
     if not concrete:  # nothing concrete is differentiated

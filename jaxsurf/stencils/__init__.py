@@ -1,1 +1,1 @@
-"""Stencils: kernels, monomials, the batched moment solves, and the two methods built on them."""
+"""Stencils: what they differentiate, the methods, and the operators made of their weights."""

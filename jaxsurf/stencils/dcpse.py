@@ -10,10 +10,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .kernels import gaussian, taper
+from ..fits.kernels import gaussian, taper
+from ..fits.moments import moment_solve
+from ..fits.monomials import polynomial_count
 from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive, with_center
-from .moments import moment_solve
-from .monomials import polynomial_count
 from .targets import AbstractTarget, Laplacian
 
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 
+from ..fits.moments import moment_solve
+from ..fits.monomials import polynomial_count
+from ..fits.plane import TangentPlane
 from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive, with_center
-from .moments import moment_solve
-from .monomials import polynomial_count
-from .plane import TangentPlane
 from .targets import AbstractTarget
 
 

@@ -7,34 +7,11 @@ import abc
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..arguments import real, whole
-from .kernels import support
+from ..fits.plane import Neighborhood, dot
 from .targets import AbstractTarget
-
-
-class Neighborhood(eqx.Module):
-    """What the stencils of a block of points see: offsets and normals of the neighbours.
-
-    The centre comes first. The last axis, `*p`, is the points of the block; without it, all
-    that is made of a neighbourhood is for a single point.
-    """
-
-    offsets: Float[Array, "k d *p"]
-    normals: Float[Array, "k d *p"]
-    mask: Bool[Array, "k *p"]
-    radius: Float[Array, "*p"] | None
-
-    def support(self, dim: int, given: float | None) -> Float[Array, "*p"]:
-        """Support radius of a method: the given one, that of the search, or a length filled."""
-        radius = self.radius if given is None else given
-        return support(self.squared, self.mask, dim=dim, radius=radius)
-
-    @property
-    def squared(self) -> Float[Array, "k *p"]:
-        """Squared distances from the centre."""
-        return dot(self.offsets, self.offsets)
 
 
 class Diagnostics(eqx.Module):
@@ -141,8 +118,3 @@ def check_positive(method: AbstractMethod, **least: bool) -> None:
 def with_center(eta: Float[Array, "c k *p"]) -> Float[Array, "c k *p"]:
     """Weights that sum to zero: those of the neighbours as given, the centre's made up."""
     return eta.at[:, 0].set(-jnp.sum(eta[:, 1:], axis=1))
-
-
-def dot(a: Float[Array, "k d *p"], b: Float[Array, "#k d *p"]) -> Float[Array, "k *p"]:
-    """Scalar products; written out, as sums over an axis between others are slow."""
-    return sum((a[:, i] * b[:, i] for i in range(1, a.shape[1])), a[:, 0] * b[:, 0])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .monomials import derivative_at_origin, multi_indices
+from ..fits.monomials import derivative_at_origin, multi_indices
 
 
 def _unit(dim: int, *axes: int) -> tuple[int, ...]:

@@ -100,3 +100,15 @@ def _soft_radius(r2, mask, target, dim):
     t = jax.lax.while_loop(moving, newton, (start - 5, start + 5, start, infinite, 0))[2]
     # One more step, the only one that is differentiated: the implicit function theorem.
     return jnp.exp(t + (target - count(r2, t)) / jnp.maximum(slope(t), 1e-3))
+
+
+def enclosing(r2: Float[Array, "k *p"], mask: Bool[Array, "k *p"]) -> Float[Array, "*p"]:
+    """Smooth stand-in for the largest squared distance, never below it; 1 in rows that are off."""
+    scale = jnp.where(mask[0], jax.lax.stop_gradient(jnp.max(r2, axis=0)), 1)
+    total = jnp.sum(jnp.where(mask, r2 / scale, 0) ** 8, axis=0)
+    return jnp.where(mask[0], scale * jnp.where(mask[0], total, 1) ** (1 / 8), 1)
+
+
+def bell(s: Float[Array, "*q"]) -> Float[Array, "*q"]:
+    r"""$e^{-2s}(1 - s)^3$ for $s = r^2/\rho^2 < 1$, else 0: wide, for fits that average."""
+    return jnp.exp(-2 * s) * jnp.maximum(1 - s, 0) ** 3

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
-from ..compiling import namespace
+from ..compiling import AnyArray, namespace
 from . import systems
 from .monomials import differentiation, monomial_rows, monomials, multi_indices, position
 
@@ -78,10 +78,19 @@ def _solve(x, w, b, low, high):
 def _system(x, w, low, high):
     """All monomials, the number of those below the basis, the Gram matrix and its solver."""
     start = len(multi_indices(len(x), 0, low - 1))
-    small = systems.is_small(len(multi_indices(len(x), low, high)))
+    small = _is_small(x, low, high)
     v: list[Array] | Array = monomial_rows(x, high) if small else monomials(x, high)
     gram = _gram(x, w, low, high)
     return v, start, gram, systems.factor(gram)
+
+
+def _is_small(x, low, high) -> bool:
+    """Whether straight-line code pays: it needs the points of a block behind each number."""
+    return (
+        x.ndim > 2
+        and namespace(x) is jnp
+        and systems.is_small(len(multi_indices(len(x), low, high)))
+    )
 
 
 @moment_solve.defjvp
@@ -98,42 +107,57 @@ def _moment_solve_jvp(low, high, primals, tangents):
     return (eta, condition, residual), (d_eta, jnp.zeros_like(condition), jnp.zeros_like(residual))
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
 def polynomial_fit(
-    x: Float[Array, "dim q *p"],
-    w: Float[Array, "q *p"],
-    values: Float[Array, "c q *p"],
+    x: Float[AnyArray, "dim q *p"],
+    w: Float[AnyArray, "q *p"],
+    values: Float[AnyArray, "c q *p"],
     low: int,
     high: int,
-) -> Float[Array, "m c *p"]:
+) -> tuple[Float[AnyArray, "m c *p"], Float[AnyArray, "*p"]]:
     r"""Coefficients a that minimise $\sum_q w_q (\sum_\gamma a_\gamma x_q^\gamma - z_q)^2$.
 
     Args:
         x, w, low, high: as for `moment_solve`, whose matrix A is that of the normal equations.
+            Arrays of NumPy are left to it, in their own precision.
         values: z, of c functions.
+
+    Returns:
+        The coefficients, and the condition number as `moment_solve` estimates it.
 
     Differentiable: forward and reverse, in x, w and values, by the closed form.
     """
+    if namespace(x) is np:
+        return _fit(x, w, values, low, high)[0]
+    return _polynomial_fit(x, w, values, low, high)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
+def _polynomial_fit(x, w, values, low, high):
     return _fit(x, w, values, low, high)[0]
 
 
 def _fit(x, w, values, low, high):
-    v, start, _, (solve, _) = _system(x, w, low, high)
-    a = solve(systems.moments(v[start:], w * values))
-    return (jnp.stack(a) if isinstance(a, list) else a), (v, start, solve)
+    v, start, _, (solve, condition) = _system(x, w, low, high)
+    basis = v[start:]
+    a = solve(systems.moments(basis, w * values), refined=False)
+    # Refined by the residual: squaring the condition number costs digits, many in float32.
+    left = values - systems.combine(a, basis)
+    a = systems.add(a, solve(systems.moments(basis, w * left), refined=False))
+    return (jnp.stack(a) if isinstance(a, list) else a, condition), (v, start, solve)
 
 
-@polynomial_fit.defjvp
+@_polynomial_fit.defjvp
 def _polynomial_fit_jvp(low, high, primals, tangents):
     # With the residual e = z - V a:  A da = V^T (dw e + w (dz - dV a)) + dV^T (w e).
     x, w, values = primals
     dx, dw, dz = tangents
-    out, (v, start, solve) = _fit(x, w, values, low, high)
+    (out, condition), (v, start, solve) = _fit(x, w, values, low, high)
     a = list(out) if isinstance(v, list) else out
     left = values - systems.combine(a, v[start:])
     g = dw * left + w * (dz - _moved(a, v, dx, start, high))
     da = solve(_add_moved_moments(systems.moments(v[start:], g), w * left, v, dx, start, high))
-    return out, (jnp.stack(da) if isinstance(v, list) else da)
+    da = jnp.stack(da) if isinstance(v, list) else da
+    return (out, condition), (da, jnp.zeros_like(condition))
 
 
 def _moved(a, v, dx, start, high):
@@ -165,16 +189,16 @@ def _gather_table(dim: int, low: int, high: int) -> tuple[np.ndarray, np.ndarray
 
 def _gram(x, w, low, high):
     basis = multi_indices(len(x), low, high)
-    if systems.is_small(len(basis)):
+    if _is_small(x, low, high):
         place = position(len(x), 2 * high)
         sums = [jnp.sum(row, axis=0) for row in monomial_rows(x, 2 * high, w)]
         total = (basis[:, None] + basis).tolist()
         return [[sums[place[tuple(g)]] for g in row] for row in total]
     # Moments as one small matrix product: monomials in all coordinates but the last, times
     # powers of the last.
-    powers = monomials(x[-1:], 2 * high)
-    others = monomials(x[:-1], 2 * high) if len(x) > 1 else jnp.ones_like(x)
-    moments = jnp.einsum("aq...,bq...->ab...", others * w, powers)
+    powers, xp = monomials(x[-1:], 2 * high), namespace(x)
+    others = monomials(x[:-1], 2 * high) if len(x) > 1 else xp.ones_like(x)
+    moments = xp.einsum("aq...,bq...->ab...", others * w, powers)
     return moments[_gather_table(len(x), low, high)]
 
 

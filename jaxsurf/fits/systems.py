@@ -3,7 +3,8 @@ r"""Linear algebra of the small systems: products with a basis, and symmetric so
 Two forms of the same operations. In *small* ones a vector over the basis is a list of arrays, and
 sums over the neighbours are straight-line code on its entries, which a compiler makes loops over
 the points of a block. Matrices are factored in loops over columns, all points at a time. In large
-ones a vector is one array, and library calls do the work matrix by matrix.
+ones a vector is one array, and library calls do the work matrix by matrix; NumPy does it for its
+arrays, compiled by nobody.
 
 Shapes: q points of a neighbourhood, c right-hand sides, m monomials, `*p` points of a block.
 """
@@ -16,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..compiling import is_quick
+from ..compiling import is_quick, namespace
 
 # Up to this number of unknowns a system is small.
 _SMALL = 15
@@ -31,14 +32,14 @@ def combine(a, v):
     """Polynomials at the points, `(c, q, *p)`: the monomials v with coefficients a."""
     if isinstance(v, list):
         return _total(a_i[:, None] * v_i for a_i, v_i in zip(a, v))
-    return jnp.einsum("mc...,mq...->cq...", a, v)
+    return namespace(v).einsum("mc...,mq...->cq...", a, v)
 
 
 def moments(v, eta):
     """Moments of the weights eta `(c, q, *p)`."""
     if isinstance(v, list):
         return [jnp.sum(eta * v_i, axis=1) for v_i in v]
-    return jnp.einsum("mq...,cq...->mc...", v, eta)
+    return namespace(v).einsum("mq...,cq...->mc...", v, eta)
 
 
 def symmetric(gram, a):
@@ -71,16 +72,19 @@ def factor(gram):
     small = isinstance(gram, list)
     a = jnp.stack([jnp.stack(row) for row in gram]) if small else gram
     diagonal = _diagonal(a)
-    scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
+    rsqrt = jax.lax.rsqrt if namespace(a) is jnp else lambda x: 1 / np.sqrt(x)
+    scale = rsqrt(namespace(a).where(diagonal > 0, diagonal, 1))
     a = a * scale * scale[:, None]
     shift = 4 * len(a) * jnp.finfo(a.dtype).eps
     solve_scaled, pivot = (_by_columns if small else _by_lapack)(a, shift)
 
-    def solve(b):
-        x = solve_scaled((jnp.stack(b) if small else b) * scale[:, None]) * scale[:, None]
+    def solve(b, refined=True):
+        b = (jnp.stack(b) if small else b) * scale[:, None]
+        x = solve_scaled(b, refined) * scale[:, None]
         return list(x) if small else x
 
-    return solve, (jnp.max(pivot, axis=0) / jnp.min(pivot, axis=0)) ** 2
+    xp = namespace(pivot)
+    return solve, (xp.max(pivot, axis=0) / xp.min(pivot, axis=0)) ** 2
 
 
 def _by_columns(a, shift):
@@ -114,26 +118,33 @@ def _by_columns(a, shift):
         y = jax.lax.fori_loop(0, m, forward, jnp.zeros_like(b))
         return jax.lax.fori_loop(0, m, backward, jnp.zeros_like(b))
 
-    def solve(b):
+    def solve(b, refined):
         def refine(_, x):
             return x + substitute(b - jnp.sum(a[:, :, None] * x[:, None], axis=0))
 
-        return jax.lax.fori_loop(0, 2, refine, jnp.zeros_like(b))
+        return jax.lax.fori_loop(0, 2, refine, jnp.zeros_like(b)) if refined else substitute(b)
 
     return solve, pivot
 
 
 def _by_lapack(a, shift):
-    a = jnp.moveaxis(a, (0, 1), (-2, -1))  # LAPACK wants the matrix last
-    chol = jnp.linalg.cholesky(a + shift * jnp.eye(a.shape[-1], dtype=a.dtype))
+    xp = namespace(a)
+    a = xp.moveaxis(a, (0, 1), (-2, -1))  # LAPACK wants the matrix last
+    chol = xp.linalg.cholesky(a + shift * xp.eye(a.shape[-1], dtype=a.dtype))
+    if xp is np:
+        inverse = np.linalg.inv(chol)  # NumPy has no triangular solves of many matrices
+        substitute = lambda b: inverse.swapaxes(-2, -1) @ (inverse @ b)
+    else:
+        substitute = lambda b: jax.scipy.linalg.cho_solve((chol, True), b)
 
-    def solve(b):
-        b = jnp.moveaxis(b, (0, 1), (-2, -1))
-        first = jax.scipy.linalg.cho_solve((chol, True), b)
-        second = jax.scipy.linalg.cho_solve((chol, True), b - a @ first)
-        return jnp.moveaxis(first + second, (-2, -1), (0, 1))
+    def solve(b, refined):
+        b = xp.moveaxis(b, (0, 1), (-2, -1))
+        x = substitute(b)
+        if refined:
+            x = x + substitute(b - a @ x)
+        return xp.moveaxis(x, (-2, -1), (0, 1))
 
-    return solve, jnp.moveaxis(jnp.diagonal(chol, axis1=-2, axis2=-1), -1, 0)
+    return solve, xp.moveaxis(xp.diagonal(chol, axis1=-2, axis2=-1), -1, 0)
 
 
 def _diagonal(a):

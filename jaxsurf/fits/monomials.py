@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..compiling import namespace
+
 
 @functools.cache
 def multi_indices(dim: int, low: int, high: int) -> np.ndarray:
@@ -51,19 +53,19 @@ def _parents(dim: int, high: int) -> tuple[tuple[int, int], ...]:
 
 def monomials(x: Float[Array, "dim *q"], high: int) -> Float[Array, "m *q"]:
     """All monomials of degree 0 to `high`, one multiplication each, a degree at a time."""
-    return jnp.concatenate(monomials_by_degree(x, high))
+    return namespace(x).concatenate(monomials_by_degree(x, high))
 
 
 def monomials_by_degree(x: Float[Array, "dim *q"], high: int) -> list[Float[Array, "_ *q"]]:
     """The same with each degree apart."""
-    dim = len(x)
-    degrees = [jnp.ones_like(x[:1])]
+    dim, xp = len(x), namespace(x)
+    degrees = [xp.ones_like(x[:1])]
     for degree in range(1, high + 1):
         # Those that begin with x_a are x_a times the lower ones in x_a and the coordinates after
         # it, which stand last.
         lower = degrees[-1]
         tails = [math.comb(degree - 1 + dim - 1 - a, dim - 1 - a) for a in range(dim)]
-        degrees.append(jnp.concatenate([x[a] * lower[-t:] for a, t in enumerate(tails)]))
+        degrees.append(xp.concatenate([x[a] * lower[-t:] for a, t in enumerate(tails)]))
     return degrees
 
 

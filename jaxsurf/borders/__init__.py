@@ -1,0 +1,1 @@
+"""Borders of surfaces: which points lie on one, their order along it, outward conormals."""

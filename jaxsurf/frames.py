@@ -12,7 +12,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.spatial import cKDTree
 
-from .arguments import as_float, in_range, instance, is_concrete, mask, raise_at, whole
+from .arguments import (
+    as_float,
+    in_range,
+    instance,
+    is_concrete,
+    mask,
+    raise_at,
+    switched_off,
+    whole,
+)
 from .cloud import PointCloud
 from .neighbors import Neighbors, check_count, check_spacing, nearest
 from .orient import check_one_sided, orient_normals, plane_normals
@@ -271,6 +280,8 @@ def refit_normals(
         radius = jnp.broadcast_to(jnp.asarray(radius, points.dtype), n)
     i = jnp.arange(n)
     slots, accepted = neighbors.indices, neighbors.mask
+    given, points = normals, switched_off(on, points)
+    normals = switched_off(on, given, np.eye(points.shape[1])[0])
     fitted = _refit(points, i, normals, slots, accepted, radius, degree, iterations, batch_size)[0]
     cosine = jnp.sum(fitted * normals, axis=1)
     if is_concrete(cosine, on):
@@ -280,9 +291,9 @@ def refit_normals(
             "the points do not resolve the surface there, use more points or a lower degree",
             np.asarray(cosine),
         )
-        return fitted
+        return switched_off(on, fitted, given)
     bad = on & ((count < needed) | ~(cosine > 0))
-    return jnp.where(bad[:, None], jnp.nan, fitted)
+    return switched_off(on, jnp.where(bad[:, None], jnp.nan, fitted), given)
 
 
 def _checked_shape(points) -> Float[Array, "n d"]:

@@ -431,6 +431,7 @@ def tube_ratio(cloud: PointCloud, neighbors: Neighbors) -> Float[Array, " n"]:
     instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
     if neighbors.n != cloud.n:
         raise ValueError(f"neighbors of {neighbors.n} points, the cloud has {cloud.n}")
+    cloud, neighbors = cloud.seen, switched_on(cloud, neighbors)
     return _bend(cloud.points, cloud.normals, neighbors.indices.T, neighbors.mask.T)
 
 
@@ -446,3 +447,16 @@ def _bend(points, normals, slots, masks):
         return jnp.where(used, jnp.abs(turn) / jnp.where(used, squared, 1), 0)
 
     return jnp.max(jax.lax.map(bend, (slots, masks)), axis=0)
+
+
+def switched_on(cloud: PointCloud, neighbors: Neighbors) -> Neighbors:
+    """The lists less points that are switched off, whatever cloud they were found on."""
+    if cloud.active is None or neighbors.n != cloud.n:
+        return neighbors
+    mask = _used(cloud.active, neighbors.indices, neighbors.mask)
+    return Neighbors(neighbors.indices, mask, neighbors.radius)
+
+
+@jax.jit
+def _used(active, indices, mask):
+    return mask & active[indices] & active[:, None]

@@ -101,7 +101,7 @@ def _weights(operator, total, preconditioner):
     options = {"preconditioner": inverse}
     solver = BiCGStab(_SOLVED * float(jnp.finfo(dtype).eps))
     sigma = jnp.asarray(system.sigma)
-    rhs = system.constant(-sigma * total / operator.n)
+    rhs = system.constant(-sigma * total / system.count)
 
     def solved(matrix, b):
         return lx.linear_solve(matrix, b, solver, options=options, throw=False).value

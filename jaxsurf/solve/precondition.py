@@ -11,11 +11,11 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float
 
-from ..arguments import instance, is_concrete
+from ..arguments import instance, is_concrete, switched_off
 from ..boundary import Closure
 from ..stencils.stencil import AbstractOperator, Composition, Stencil, check_scalar
 from .padded import Layout, PaddedMatrix, incoming_layout
-from .reduced import annihilates_constants, reduced_matrix
+from .reduced import annihilates_constants, free_points, reduced_matrix
 
 # The coarsest system has at most this many unknowns and is solved by a dense inverse.
 _COARSEST = 400
@@ -217,6 +217,7 @@ def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> 
     if not isinstance(operator, Stencil):
         raise ValueError(f"the diagonal of a {type(operator).__name__} is not at hand")
     diagonal = operator.diagonal
+    diagonal = switched_off(operator.active, diagonal, 1)
     if conditions is not None:
         diagonal = jnp.where(conditions.bound, 1, diagonal)
     incoming = incoming_layout(operator) if is_concrete(operator.indices) else None
@@ -279,13 +280,12 @@ def hierarchy(operator, conditions, *, single: bool = True, layout: bool = True)
         )
         return _Product.of(outer, inner)
     matrix = reduced_matrix(operator, conditions)
-    mean_zero = annihilates_constants(matrix, conditions)
+    free = free_points(operator, conditions)
+    mean_zero = annihilates_constants(matrix, free)
     dtype = np.dtype(np.float32) if single else matrix.dtype
     width = USED * operator.k if isinstance(operator, Stencil) else None
     levels = []
-    constant = np.ones(matrix.shape[0])
-    if conditions is not None:
-        constant[np.asarray(conditions.rows)] = 0
+    constant = free.astype(float)
     fine, room = matrix, matrix.shape[0]
     while room > _COARSEST:
         found = aggregate(fine, constant)

@@ -14,7 +14,7 @@ _ROUNDOFF = 32
 
 
 def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
-    """P A E as a CSR matrix, zero in the rows of bound points.
+    """P A E as a CSR matrix, zero in the rows of bound and of switched-off points.
 
     Raises:
         ValueError: traced or non-finite weights.
@@ -34,20 +34,24 @@ def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
             raise ValueError(f"conditions for {conditions.n} points, the operator has {operator.n}")
         free = scipy.sparse.diags((~np.asarray(conditions.bound)).astype(matrix.dtype))
         matrix = (free @ matrix @ conditions.to_scipy()).tocsr()
+    if operator.active is not None:
+        on = scipy.sparse.diags(np.asarray(operator.active).astype(matrix.dtype))
+        matrix = (on @ matrix).tocsr()
+    if conditions is not None or operator.active is not None:
         matrix.eliminate_zeros()
     return matrix
 
 
 def reduced_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
-    """P A E with the identity at bound points, as a CSR matrix.
+    """P A E with the identity at points that are bound or switched off, as a CSR matrix.
 
     Raises:
         ValueError: traced or non-finite weights, or a zero row.
     """
     matrix = free_matrix(operator, conditions)
-    if conditions is not None:
-        bound = np.asarray(conditions.bound).astype(matrix.dtype)
-        matrix = (matrix + scipy.sparse.diags(bound)).tocsr()
+    known = ~free_points(operator, conditions)
+    if known.any():
+        matrix = (matrix + scipy.sparse.diags(known.astype(matrix.dtype))).tocsr()
     empty = np.flatnonzero(np.diff(matrix.indptr) == 0)
     if empty.size:
         raise ValueError(
@@ -57,15 +61,20 @@ def reduced_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
     return matrix
 
 
-def annihilates_constants(matrix, conditions=None) -> bool:
+def free_points(operator, conditions) -> np.ndarray:
+    """Which points are switched on and not bound, on the host."""
+    free = np.ones(operator.n, bool) if operator.active is None else np.array(operator.active)
+    if conditions is not None:
+        free[np.asarray(conditions.rows)] = False
+    return free
+
+
+def annihilates_constants(matrix, free: np.ndarray) -> bool:
     """Whether the constants on the free points are in the null space, by the row sums.
 
     Raises:
         ValueError: they are on one of several disconnected parts.
     """
-    free = np.ones(matrix.shape[0], bool)
-    if conditions is not None:
-        free[np.asarray(conditions.rows)] = False
     # Entries of free rows are in free columns.
     sums = np.abs(np.add.reduceat(matrix.data, matrix.indptr[:-1]))
     sizes = np.add.reduceat(np.abs(matrix.data), matrix.indptr[:-1])

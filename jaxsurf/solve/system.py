@@ -11,7 +11,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..arguments import instance, real
+from ..arguments import count_on, instance, real, switched_off
 from ..boundary import Closure, check_border
 from ..stencils.stencil import AbstractOperator, Composition, Stencil, check_scalar
 from .padded import Layout, adjoint
@@ -63,6 +63,10 @@ class Linearised(AbstractOperator):
     def n(self):
         return self.operator.n
 
+    @property
+    def active(self):
+        return self.operator.active
+
     def __call__(self, u):
         return self.operator(u) + self.slope(u)
 
@@ -102,7 +106,7 @@ class System(Square):
 
     Args:
         operator: A.
-        conditions: E, and P which keeps free points; None if all are free.
+        conditions: E, and P which keeps free points; None if all are free that are switched on.
         sigma: σ; None if the constants are not in the null space of P A E.
         layout: of the transpose of A, if known.
         dtype: of the fields.
@@ -132,8 +136,8 @@ class System(Square):
     def products(self, fields: Float[Array, "n c"]) -> Float[Array, "n c"]:
         """P A E of several fields at once."""
         if self.conditions is None:
-            return self.operator(fields)
-        return self.conditions.restrict(self.operator(self.conditions.homogeneous(fields)))
+            return self.free(self.operator(fields))
+        return self.free(self.operator(self.conditions.homogeneous(fields)))
 
     def spread(self) -> Float[Array, "*n"]:
         """One over half the row sums of moduli: the square of a distance for a Laplacian."""
@@ -151,6 +155,7 @@ class System(Square):
 
     def free(self, v):
         """P v."""
+        v = switched_off(self.operator.active, v)
         return v if self.conditions is None else self.conditions.restrict(v)
 
     def constant(self, value):
@@ -159,8 +164,13 @@ class System(Square):
 
     def mean(self, v):
         """Over free points."""
-        count = self.operator.n - (0 if self.conditions is None else self.conditions.m)
-        return jnp.sum(self.free(v)) / count
+        return jnp.sum(self.free(v)) / self.count
+
+    @property
+    def count(self):
+        """Number of free points."""
+        bound = 0 if self.conditions is None else self.conditions.m
+        return count_on(self.operator.active, self.operator.n) - bound
 
     def shift(self, v):
         r"""$-\sigma$ times the mean: where the system holds, $P A E v = f - p\,$ shift(v)."""
@@ -186,7 +196,7 @@ class Transposed(Square):
         if self.adjoint is None:
             (v,) = jax.linear_transpose(system.operator, shape)(v)
         else:
-            v = self.adjoint(v)
+            v = switched_off(system.operator.active, self.adjoint(v))
         if system.conditions is not None:
             v = _turned(system.conditions, v)
         return v + system.rest(vector)

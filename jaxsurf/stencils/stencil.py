@@ -365,6 +365,8 @@ class Composition(AbstractOperator):
 
     @property
     def active(self):
+        if self.inner.active is self.outer.active:
+            return self.inner.active
         known = [a for a in (self.inner.active, self.outer.active) if a is not None]
         both = (np if is_concrete(*known) else jnp).logical_and
         return functools.reduce(both, known) if known else None

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..arguments import as_float, finite, instance, is_concrete, switched_off
@@ -70,7 +71,7 @@ class AbstractEvolution(eqx.Module):
         return False
 
     @property
-    def active(self) -> Bool[Array, " n"] | None:
+    def active(self) -> Bool[Array | np.ndarray, " n"] | None:
         """False at points that are switched off, as its operators say; None if all are on."""
         return _known_active(*vars(self).values())
 
@@ -477,7 +478,7 @@ class WaveEquation(AbstractEvolution):
 # --- pieces --------------------------------------------------------------------------------
 
 
-def _known_active(*parts) -> Bool[Array, " n"] | None:
+def _known_active(*parts) -> Bool[Array | np.ndarray, " n"] | None:
     """What the first operator among them that knows says."""
     known = [part.active for part in parts if isinstance(part, AbstractOperator)]
     return next((active for active in known if active is not None), None)

@@ -200,7 +200,7 @@ def planned(
     allowed = _allowed(max_steps, saveat, t0, t1, dt0, controller)
     check_coefficients(problem, t0, t1)
     if problem.active is not None and getattr(controller, "norm", None) is optx.rms_norm:
-        controller = eqx.tree_at(lambda c: c.norm, controller, Norm(problem.active))
+        controller = eqx.tree_at(lambda c: c.norm, controller, Norm(jnp.asarray(problem.active)))
     arrays = numbers_as_arrays(problem)
     now = (t0, u0, args)
     terms = _terms(arrays, solver, now)
@@ -339,7 +339,7 @@ def _ending(event: dfx.Event, problem: AbstractEvolution, now, told: dict) -> df
     def new(condition):
         if isinstance(condition, eqx.Module):  # has numbers of its own as leaves
             if problem.active is not None and getattr(condition, "norm", None) is root_mean_square:
-                return eqx.tree_at(lambda c: c.norm, condition, Norm(problem.active))
+                return eqx.tree_at(lambda c: c.norm, condition, Norm(jnp.asarray(problem.active)))
             return condition
         return _Ending(closed(problem, lambda t, y, args: condition(t, y, args, **told), now))
 

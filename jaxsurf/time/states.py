@@ -5,6 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..arguments import count_on, switched_off
@@ -20,7 +21,7 @@ def root_mean_square(y: PyTree[Array]) -> Float[Array, ""]:
     return length(y) / max(sum(leaf.size for leaf in jax.tree.leaves(y)), 1) ** 0.5
 
 
-def only_on(active: Bool[Array, " n"] | None, tree: PyTree) -> PyTree:
+def only_on(active: Bool[Array | np.ndarray, " n"] | None, tree: PyTree) -> PyTree:
     """A state or a rate with zeros in the rows of points that are switched off."""
     if active is None:
         return tree

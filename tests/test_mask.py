@@ -740,9 +740,9 @@ def test_another_mask_compiles_nothing(name):
         warnings.simplefilter("ignore")  # of few points
         jax.block_until_ready(f(masked(1, N)))
         if name == "integrals":  # cells of uneven points have a program of their own
-            jax.block_until_ready(f(masked(2, N)))
+            jax.block_until_ready(f(masked(4, N + 10)))
         with count_compilations() as names:
-            for seed, count in ((3, N), (4, N + 10)):
+            for seed, count in ((3, N), (2, N + 10), (5, N + 5)):
                 jax.block_until_ready(f(masked(seed, count)))
     assert not names, names
 
@@ -778,3 +778,28 @@ def test_the_mask_may_be_traced():
         np.testing.assert_allclose(found[c.rows], want, rtol=0, atol=EXACT * size)
         assert not np.delete(found, c.rows).any()
     assert len(traced) == 1
+
+
+@pytest.mark.slow
+def test_multigrid_with_levels():
+    """Of more unknowns than are solved for at once."""
+    x = np.asarray(jittered_sphere(480, fraction=0.1).points)
+    rows = np.sort(np.random.default_rng(0).permutation(720)[:480])
+
+    def found(n, rows):
+        points = np.full((n, 3), np.nan)
+        points[rows] = x
+        cloud = js.PointCloud(points, points, active=np.isin(np.arange(n), rows))
+        operator = L(cloud, js.find_neighbors(cloud, 36), method=METHOD).scaled(-1.0).shifted(0.1)
+        hierarchy = js.multigrid(operator)
+        assert len(hierarchy.levels) == 1
+        u = np.full(n, np.nan)
+        u[rows] = smooth(x)
+        solution = js.solve(operator, jnp.asarray(u), preconditioner=hierarchy, rtol=1e-11)
+        assert solution.stats["num_steps"] < 12
+        return solution.value
+
+    want, have = found(480, np.arange(480)), found(720, rows)
+    size = float(jnp.abs(want).max())
+    np.testing.assert_allclose(have[rows], want, rtol=0, atol=SOLVED * size)
+    assert not np.delete(have, rows).any()

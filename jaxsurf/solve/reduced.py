@@ -35,8 +35,8 @@ def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
         free = scipy.sparse.diags((~np.asarray(conditions.bound)).astype(matrix.dtype))
         matrix = (free @ matrix @ conditions.to_scipy()).tocsr()
     if operator.active is not None:
-        on = scipy.sparse.diags(np.asarray(operator.active).astype(matrix.dtype))
-        matrix = (on @ matrix).tocsr()
+        # In place: products change the order of the entries, and with it the aggregates.
+        matrix.data *= np.repeat(np.asarray(operator.active), np.diff(matrix.indptr))
     if conditions is not None or operator.active is not None:
         matrix.eliminate_zeros()
     return matrix
@@ -49,9 +49,15 @@ def reduced_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
         ValueError: traced or non-finite weights, or a zero row.
     """
     matrix = free_matrix(operator, conditions)
-    known = ~free_points(operator, conditions)
-    if known.any():
-        matrix = (matrix + scipy.sparse.diags(known.astype(matrix.dtype))).tocsr()
+    if conditions is not None:
+        bound = np.asarray(conditions.bound).astype(matrix.dtype)
+        matrix = (matrix + scipy.sparse.diags(bound)).tocsr()
+    if operator.active is not None:
+        off = np.flatnonzero(~np.asarray(operator.active))
+        place = matrix.indptr[off]
+        data, columns = np.insert(matrix.data, place, 1), np.insert(matrix.indices, place, off)
+        pointers = matrix.indptr + np.searchsorted(off, np.arange(len(matrix.indptr)))
+        matrix = scipy.sparse.csr_matrix((data, columns, pointers), shape=matrix.shape)
     empty = np.flatnonzero(np.diff(matrix.indptr) == 0)
     if empty.size:
         raise ValueError(

@@ -75,7 +75,7 @@ def on_host(x: Any, name: str = "array") -> np.ndarray:
     return _real_numbers(x, name).astype(float)
 
 
-def switched_off(on: Any, x: Any, value: Any = 0) -> Any:
+def switched_off(on: Any, x: Any, value: Any = 0) -> Array:
     """An array of one row for each point, with a value in the rows of those that are switched off.
 
     What stands there has no part in anything, nor in derivatives.

@@ -161,7 +161,7 @@ def _from_points(contents: Contents, n, spacing, degree: int) -> PointCloud:
     if normals is None:
         found = np.zeros_like(points)
         found[on] = estimate_normals(x[names], degree=degree)
-        return PointCloud(x, found, **own)
+        return PointCloud(x, jnp.asarray(found), **own)
     return PointCloud(x, jnp.asarray(normals), **own)
 
 

@@ -210,8 +210,7 @@ class Stencil(AbstractOperator):
         indices[place, row] = source
         moved = _moved(self.weights, order, place, row, k, len(self.in_shape))
         shapes = (self.in_shape, self.out_shape)
-        known = dict(border=self.border, active=self.active)
-        return Stencil(jnp.asarray(indices), moved, *shapes, **known)
+        return Stencil(jnp.asarray(indices), moved, *shapes, None, self.border, self.active)
 
     def to_scipy(self):
         p, q, n = math.prod(self.out_shape), math.prod(self.in_shape), self.n
@@ -239,8 +238,7 @@ class Stencil(AbstractOperator):
 
     def scaled(self, factor: Float[Array, " n"] | float) -> Stencil:
         """The operator with row i multiplied by `factor[i]`."""
-        factor = _per_point(factor, self.n, "factor", self.weights.dtype)
-        factor = switched_off(self.active, factor) if factor.ndim else factor
+        factor = _per_point(factor, self, "factor")
         return eqx.tree_at(lambda s: s.weights, self, self.weights * factor)
 
     def shifted(self, term: Float[Array, " n"] | float) -> Stencil:
@@ -250,8 +248,7 @@ class Stencil(AbstractOperator):
         a transpose may, one more slot is added; which needs concrete indices.
         """
         check_scalar(self)
-        term = _per_point(term, self.n, "term", self.weights.dtype)
-        term = switched_off(self.active, term) if term.ndim else term
+        term = _per_point(term, self, "term")
         indices, weights = self.indices, self.weights
         if is_concrete(indices):
             own = np.asarray(indices) == np.arange(self.n)
@@ -304,11 +301,13 @@ class Stencil(AbstractOperator):
                 tuple(data.pop(name).tolist()) for name in ("out_shape", "in_shape")
             )
             indices, weights = jnp.asarray(data.pop("indices")), jnp.asarray(data.pop("weights"))
-            masks = (data.pop(name, None) for name in ("border", "active"))
-            masks = [None if found is None else jnp.asarray(found) for found in masks]
+            border, active = (
+                jnp.asarray(data.pop(name)) if name in data else None
+                for name in ("border", "active")
+            )
             extra = {name: jnp.asarray(value) for name, value in data.items()}
             diagnostics = Diagnostics(**extra) if extra else None
-            return cls(indices, weights, out_shape, in_shape, diagnostics, *masks)
+            return cls(indices, weights, out_shape, in_shape, diagnostics, border, active)
         except FileNotFoundError:
             raise
         except _DAMAGE as error:
@@ -391,12 +390,14 @@ def check_scalar(operator: AbstractOperator) -> None:
         raise ValueError(f"an operator on scalar fields is needed, not from {shapes} components")
 
 
-def _per_point(value, n: int, name: str, dtype):
+def _per_point(value, operator: Stencil, name: str):
     """A number or one number per point, in the precision of the operator."""
+    n, dtype = operator.n, operator.weights.dtype
     value = as_float(value, name)
     if value.shape not in ((), (n,)):
         raise ValueError(f"{name} has shape {value.shape}, expected () or ({n},)")
-    return value.astype(dtype)
+    value = value.astype(dtype)
+    return switched_off(operator.active, value) if value.ndim else value
 
 
 def _counts(count) -> str:

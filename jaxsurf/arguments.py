@@ -100,6 +100,25 @@ def on_host(x: Any, name: str = "array") -> np.ndarray:
     return _real_numbers(x, name).astype(float)
 
 
+def switched_off(on: Any, x: Any, value: Any = 0) -> Array:
+    """An array of one row for each point, with a value in the rows of those that are switched off.
+
+    What stands there has no part in anything, nor in derivatives.
+
+    Args:
+        on: True at points that are on, `(n,)`; None if all are.
+    """
+    if on is None:
+        return x
+    value = jnp.asarray(value, jnp.result_type(x))
+    return jnp.where(jnp.reshape(on, (-1, *(1,) * (jnp.ndim(x) - 1))), x, value)
+
+
+def count_on(on: Any, n: int) -> Any:
+    """How many of n points are on; None: all."""
+    return n if on is None else jnp.maximum(jnp.sum(on), 1)
+
+
 def in_range(values: Any, name: str) -> Any:
     """The values, of which none may be so large that squares and cubes of lengths overflow.
 
@@ -114,15 +133,20 @@ def in_range(values: Any, name: str) -> Any:
     return values
 
 
-def finite(x: Array, name: str) -> Array:
+def finite(x: Array, name: str, on: Any = None) -> Array:
     """The array, of which every concrete entry must be a finite number.
+
+    Args:
+        on: rows that are looked at; None for all.
 
     Raises:
         ValueError: names the first row with an entry that is not.
     """
-    if is_concrete(x):
+    if is_concrete(x, on):
         values = np.asarray(x)
         good = np.isfinite(values)
+        if on is not None and values.shape[:1] == np.shape(on):
+            good = good | ~np.asarray(on).reshape(-1, *(1,) * (values.ndim - 1))
         if values.ndim == 0 and not good:
             raise ValueError(f"{name} is {values}, expected a finite number")
         if not good.all():

@@ -14,7 +14,7 @@ from .arguments import mask as checked_mask
 from .cloud import PointCloud
 from .compiling import copying_jit, namespace, sized_jit
 from .fits.moments import blockwise, in_blocks, out_of_blocks
-from .neighbors import Neighbors, Rows, find_neighbors, nearest_of
+from .neighbors import Neighbors, Rows, find_neighbors, nearest_of, switched_on
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood
 from .stencils.stencil import Stencil
@@ -82,6 +82,7 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     instance(method, AbstractMethod, "method", "DCPSE(order=2) or GFDM(degree=4), say")
     if neighbors is not None:
         instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
+        neighbors = switched_on(cloud, neighbors)
     weights = None
     if neighbors is None:
         neighbors, laplacian = _adapted(cloud, method, throw)
@@ -95,7 +96,8 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     border = cloud.boundary
     if border is not None and cloud.active is not None:
         border = border & cloud.active
-    stencil = Stencil(_turned(neighbors.indices), values, components, (), diagnostics, border)
+    known = (diagnostics, border, cloud.active)
+    stencil = Stencil(_turned(neighbors.indices), values, components, (), *known)
     if throw and is_concrete(values):
         _check(stencil, neighbors, method, target, cloud.dim)
     return stencil
@@ -117,7 +119,7 @@ def stencil_weights(
 @copying_jit
 def blocks_of(cloud, neighbors, rows, size: int):
     """Positions and normals of the neighbours of some rows, mask and radius, in blocks."""
-    slots = in_blocks(neighbors.indices.T, size)
+    cloud, slots = cloud.seen, in_blocks(neighbors.indices.T, size)
     # One coordinate at a time: one gather for all of them is slower.
     points, normals = (
         [_taken(column, slots) for column in vectors.T] for vectors in (cloud.points, cloud.normals)

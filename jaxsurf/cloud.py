@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
@@ -26,7 +27,9 @@ class PointCloud(eqx.Module):
         points: positions, `(n, d)` with d = 2 (a curve in the plane) or 3 (a surface).
         normals: unit normals, `(n, d)`, consistently oriented.
         boundary: True for points on a border of the surface, `(n,)`; None for a closed surface.
-        active: False for rows that exist but are switched off, `(n,)`; None if all are on.
+        active: False for rows that exist but are switched off, `(n,)`; None if all are on. What
+            stands in such rows, here and in fields, has no part in anything: the others get what
+            they would get without them. Results are zero there, and so are derivatives.
         spacing: distance to the nearest neighbours, `(n,)`, in the units of `points`; None to
             let operators derive it from the neighbours.
 
@@ -143,6 +146,18 @@ class PointCloud(eqx.Module):
     def host_active(self) -> Bool[np.ndarray, " n"]:
         """Which rows are switched on, as a NumPy array; concrete clouds only."""
         return np.ones(self.n, bool) if self.active is None else np.asarray(self.active)
+
+    @property
+    def seen(self) -> PointCloud:
+        """The cloud with numbers in place of what stands in switched-off rows, NaN maybe."""
+        if self.active is None:
+            return self
+        where, on = np.where if isinstance(self.points, np.ndarray) else jnp.where, self.active
+        axis = np.eye(self.dim, dtype=self.points.dtype)[0]
+        new = [where(on[:, None], self.points, 0), where(on[:, None], self.normals, axis)]
+        spacing = None if self.spacing is None else where(on, self.spacing, 1)
+        parts = lambda cloud: (cloud.points, cloud.normals, cloud.spacing)
+        return eqx.tree_at(parts, self, (*new, spacing), is_leaf=lambda x: x is None)
 
     def permuted(self, order: Int[Array, " n"]) -> PointCloud:
         """The same cloud with row `order[i]` in place i."""

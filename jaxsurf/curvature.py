@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .arguments import instance
+from .arguments import count_on, instance, switched_off
 from .cloud import PointCloud
 from .compiling import sized_jit
 from .frames import frames_of
-from .neighbors import Neighbors
+from .neighbors import Neighbors, switched_on
 from .operators import laplace_beltrami, surface_gradient
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod
@@ -56,6 +56,7 @@ def shape_tensor(
 @sized_jit
 def tensor_of(gradient, n):
     """The shape tensor: the gradient of the normals, made symmetric and tangential."""
+    n = switched_off(gradient.active, n)
     tensor = gradient(n)
     project = jnp.eye(n.shape[1], dtype=n.dtype) - n[:, :, None] * n[:, None]
     tensor = jnp.einsum("nab,nbc,ncd->nad", project, tensor, project)
@@ -208,18 +209,18 @@ def mean_curvature_vector(
         True
     """
     instance(cloud, PointCloud, "cloud")
-    return laplace_beltrami(cloud, neighbors, method=method)(_centred(cloud.points))
+    return laplace_beltrami(cloud, neighbors, method=method)(_centred(cloud.points, cloud.active))
 
 
 @jax.jit
-def _centred(points):
-    return points - points.mean(0)
+def _centred(points, active):
+    return points - switched_off(active, points).sum(0) / count_on(active, len(points))
 
 
 def _in_tangent_plane(cloud, neighbors, method):
     instance(cloud, PointCloud, "cloud")
     check_surface(cloud)
-    return along_tangents(shape_tensor(cloud, neighbors, method=method), cloud.normals)
+    return along_tangents(shape_tensor(cloud, neighbors, method=method), cloud)
 
 
 def check_surface(cloud: PointCloud) -> None:
@@ -229,9 +230,9 @@ def check_surface(cloud: PointCloud) -> None:
 
 
 @jax.jit
-def along_tangents(tensor, normals):
+def along_tangents(tensor, cloud):
     """The shape tensor as a symmetric 2 x 2 matrix, and the tangents that it refers to."""
-    tangents = frames_of(normals)[:, :2]
+    tangents = switched_off(cloud.active, frames_of(cloud.seen.normals)[:, :2])
     return jnp.einsum("nap,npq,nbq->nab", tangents, tensor, tangents), tangents
 
 
@@ -263,6 +264,7 @@ def tube_ratio(cloud: PointCloud, neighbors: Neighbors) -> Float[Array, " n"]:
     instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
     if neighbors.n != cloud.n:
         raise ValueError(f"neighbors of {neighbors.n} points, the cloud has {cloud.n}")
+    cloud, neighbors = cloud.seen, switched_on(cloud, neighbors)
     return _bend(cloud.points, cloud.normals, neighbors.indices.T, neighbors.mask.T)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from . import curvature, operators, quadrature
-from .arguments import as_float, finite, instance, is_concrete, raise_at
+from .arguments import as_float, finite, instance, is_concrete, raise_at, switched_off
 from .borders.border import Border
 from .borders.order import find_border
 from .build import build, choose_neighbors
@@ -20,7 +20,7 @@ from .compiling import copying_jit
 from .fits.monomials import polynomial_count
 from .interpolation import interpolated
 from .motion import CODES, carried, judged
-from .neighbors import Neighbors
+from .neighbors import Neighbors, switched_on
 from .stencils.algebra import Composition
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod
@@ -130,7 +130,7 @@ class Discretization(eqx.Module):
     def _joint(self) -> tuple[Stencil, Stencil]:
         """Laplacian and gradient from one factorisation of the moment matrices."""
         both = self._build(Joint((Laplacian(), Gradient())))
-        known = (both.diagnostics, both.border)
+        known = (both.diagnostics, both.border, both.active)
         laplacian, gradient = _first_and_others(both.weights)
         return (
             Stencil(both.indices, laplacian, (), (), *known),
@@ -164,17 +164,13 @@ class Discretization(eqx.Module):
     def gauss_curvature(self) -> Float[Array, " n"]:
         """See `gauss_curvature`."""
         curvature.check_surface(self.cloud)
-        return curvature.gauss_of(
-            curvature.along_tangents(self.shape_tensor, self.cloud.normals)[0]
-        )
+        return curvature.gauss_of(curvature.along_tangents(self.shape_tensor, self.cloud)[0])
 
     @property
     def principal_curvatures(self) -> tuple[Float[Array, "n 2"], Float[Array, "n 2 3"]]:
         """See `principal_curvatures`."""
         curvature.check_surface(self.cloud)
-        return curvature.principal_of(
-            *curvature.along_tangents(self.shape_tensor, self.cloud.normals)
-        )
+        return curvature.principal_of(*curvature.along_tangents(self.shape_tensor, self.cloud))
 
     # --- integrals -------------------------------------------------------------------------
 
@@ -253,7 +249,7 @@ class Discretization(eqx.Module):
         u = as_float(u, "field")
         if u.ndim < 1 or u.shape[0] != self.n:
             raise ValueError(f"field has shape {u.shape}, expected ({self.n}, ...)")
-        return u
+        return switched_off(self.cloud.active, u)
 
     # --- motion ----------------------------------------------------------------------------
 
@@ -287,7 +283,7 @@ class Discretization(eqx.Module):
         active, spacing = self.cloud.active, self.cloud.spacing
         if active is not None:
             points = jnp.where(active[:, None], points, self.cloud.points)
-        finite(points, "points")
+        finite(points, "points", active)
         if normals is None or spacing is not None:
             old = self.cloud
             ahead, stretch = carried(self.gradient, old.normals, old.points, points)
@@ -363,8 +359,8 @@ def discretize(
     if neighbors is None:
         neighbors = choose_neighbors(cloud, method=method)
     instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
-    border = None
-    if cloud.boundary is not None and np.asarray(cloud.boundary).any():
+    neighbors, border = switched_on(cloud, neighbors), None
+    if cloud.boundary is not None and (np.asarray(cloud.boundary) & cloud.host_active).any():
         border = find_border(cloud)
     return Discretization(cloud, neighbors, method, border)
 

@@ -153,7 +153,7 @@ def _values(cloud, images, conditions, owned, place, throw):
         if here.size:
             a = _on_host(jnp.broadcast_to(condition.a, condition.m))[place[root[here]]]
             sources[number].add(first + here, total[here] / a, place[root[here]])
-    free = int(np.argmax(np.bincount(np.flatnonzero(bound < 0), minlength=n)))
+    free = int(np.argmax((bound < 0) & cloud.host_active))
     depends = np.where(bound[root] < 0, root, free)
     total = total * (bound[root] < 0)
 

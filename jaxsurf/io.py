@@ -146,22 +146,26 @@ def _from_points(contents: Contents, n, spacing, degree: int) -> PointCloud:
     if n is not None or spacing is not None:
         raise ValueError("a list of points without triangles cannot be resampled")
     points, normals = contents.points, contents.normals
-    raise_at(~np.isfinite(points).all(axis=1), "point {i} is not finite: {v}", points)
-    in_range(points, "points")
-    first, group = merge_equal(points)
-    again = np.flatnonzero(first[group] != np.arange(len(points)))
-    if again.size:
-        i = again[0]
-        raise ValueError(f"points {first[group[i]]} and {i} coincide ({again.size} such points)")
-    if normals is not None:
-        normals = _unit(normals)
-        # Plane curves are kept in space by formats that know nothing else.
-        if points.shape[1] == 3 and not points[:, 2].any() and not normals[:, 2].any():
-            points, normals = points[:, :2], normals[:, :2]
     own = {k: _own(k, contents.fields[k]) for k in _OWN if k in contents.fields}
+    on = np.asarray(own.get("active", np.ones(len(points), bool)))
+    names = np.flatnonzero(on)
+    raise_at(on & ~np.isfinite(points).all(axis=1), "point {i} is not finite: {v}", points)
+    in_range(points[on], "points")
+    first, group = merge_equal(points[on])
+    again = np.flatnonzero(first[group] != np.arange(len(names)))
+    if again.size:
+        i, j = names[first[group[again[0]]]], names[again[0]]
+        raise ValueError(f"points {i} and {j} coincide ({again.size} such points)")
+    if normals is not None:
+        normals = _unit(normals, on)
+        # Plane curves are kept in space by formats that know nothing else.
+        if points.shape[1] == 3 and not points[on, 2].any() and not normals[on, 2].any():
+            points, normals = points[:, :2], normals[:, :2]
     x = jnp.asarray(points)
     if normals is None:
-        return PointCloud(x, estimate_normals(x, degree=degree), **own)
+        found = np.zeros_like(points)
+        found[on] = estimate_normals(x[names], degree=degree)
+        return PointCloud(x, jnp.asarray(found), **own)
     return PointCloud(x, jnp.asarray(normals), **own)
 
 
@@ -174,9 +178,10 @@ def _own(name: str, value: np.ndarray) -> Array:
     return jnp.asarray(value, bool)
 
 
-def _unit(normals: np.ndarray) -> np.ndarray:
+def _unit(normals: np.ndarray, on: np.ndarray | bool = True) -> np.ndarray:
     length = np.linalg.norm(normals, axis=1)
-    bad = ~(np.isfinite(length) & (length > 0))
+    bad = on & ~(np.isfinite(length) & (length > 0))
+    length = np.where(on, length, 1)
     raise_at(bad, "normal {i} is {v}, expected a direction", normals)
     return normals / length[:, None]
 
@@ -245,9 +250,9 @@ def write(
 
     VTU and VTK hold scalars `(n,)`, vectors `(n, c)` and tensors `(n, d, d)`; PLY holds scalars,
     and vectors as one scalar per component (`name_0`, `name_1`, …); XYZ holds points and normals
-    only. Plane curves are put at z = 0, their vectors and tensors filled with zeros. Boundary,
-    activity and spacing go along where the cloud has them, except to XYZ. (In ParaView, choose
-    *Point Gaussian* to see the points as a surface.)
+    only, of the points that are switched on. Plane curves are put at z = 0, their vectors and
+    tensors filled with zeros. Boundary, activity and spacing go along where the cloud has them,
+    except to XYZ. (In ParaView, choose *Point Gaussian* to see the points as a surface.)
 
     Args:
         path: .vtu, .vtk, .ply or .xyz; overwritten if it exists.
@@ -283,7 +288,8 @@ def write(
         if given:
             raise ValueError(f"{path}: XYZ holds no fields ({', '.join(given)}); take .vtu")
         names = "x y nx ny" if cloud.dim == 2 else "x y z nx ny nz"
-        np.savetxt(path, np.hstack([points, normals]), fmt="%.17g", header=names)
+        rows = np.hstack([points, normals])[cloud.host_active]
+        np.savetxt(path, rows, fmt="%.17g", header=names)
         return
     taken = ["normals", *_OWN]
     if suffix == ".ply":

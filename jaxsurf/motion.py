@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from .arguments import count_on, switched_off
 from .build import residual_tolerance
 from .frames import frames_of
 
@@ -26,11 +28,15 @@ def carried(gradient, normals, before, after):
     The gradient of the positions takes a tangent to itself but for its error, $F_0 t = A t + s n$.
     So does that of the new positions, with the images in place of t and n; which A and s then tell.
     """
+    on, dim = gradient.active, normals.shape[1]
+    normals = switched_off(on, normals, np.eye(dim)[0])
     tangents = frames_of(normals)[:, :-1]
+    middle = lambda x: jnp.sum(switched_off(on, x), axis=0) / count_on(on, len(x))
     images = [
-        jnp.einsum("nxs,nts->ntx", gradient(x - jnp.mean(x, axis=0)), tangents)
-        for x in (before, after)
+        jnp.einsum("nxs,nts->ntx", gradient(x - middle(x)), tangents) for x in (before, after)
     ]
+    # A switched-off point stays as it is.
+    images = [switched_off(on, image, tangents) for image in images]
     a = jnp.einsum("ntx,nux->ntu", images[0], tangents)
     s = jnp.einsum("ntx,nx->nt", images[0], normals)
     ahead = jnp.zeros_like(normals)

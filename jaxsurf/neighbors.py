@@ -273,3 +273,16 @@ def _within(points, normals, tree, radius, capacity, min_cosine: float, names):
     mask = np.arange(width) < count[:, None]
     slots[mask] = found
     return slots, mask
+
+
+def switched_on(cloud: PointCloud, neighbors: Neighbors) -> Neighbors:
+    """The lists less points that are switched off, whatever cloud they were found on."""
+    if cloud.active is None or neighbors.n != cloud.n:
+        return neighbors
+    mask = _used(cloud.active, neighbors.indices, neighbors.mask)
+    return Neighbors(neighbors.indices, mask, neighbors.radius)
+
+
+@jax.jit
+def _used(active, indices, mask):
+    return mask & active[indices] & active[:, None]

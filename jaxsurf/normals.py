@@ -10,7 +10,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.spatial import cKDTree
 
-from .arguments import as_float, in_range, instance, is_concrete, mask, raise_at, whole
+from .arguments import (
+    as_float,
+    in_range,
+    instance,
+    is_concrete,
+    mask,
+    raise_at,
+    switched_off,
+    whole,
+)
 from .checks import check_count, check_spacing
 from .cloud import PointCloud
 from .compiling import sized_jit
@@ -225,6 +234,8 @@ def refit_normals(
     if radius is not None:
         radius = jnp.broadcast_to(jnp.asarray(radius, points.dtype), n)
     slots, accepted = neighbors.indices, neighbors.mask
+    given, points = normals, switched_off(on, points)
+    normals = switched_off(on, given, np.eye(points.shape[1])[0])
     fitted, pivot = _refit(points, normals, slots, accepted, radius, degree, iterations, batch_size)
     determined = pivot > needed * jnp.finfo(points.dtype).eps
     fitted = jnp.where(determined[:, None], fitted, jnp.nan)
@@ -236,9 +247,9 @@ def refit_normals(
             "the points do not resolve the surface there, use more points or a lower degree",
             np.asarray(cosine),
         )
-        return fitted
+        return switched_off(on, fitted, given)
     bad = on & ((count < needed) | ~(cosine > 0))
-    return jnp.where(bad[:, None], jnp.nan, fitted)
+    return switched_off(on, jnp.where(bad[:, None], jnp.nan, fitted), given)
 
 
 def _checked_shape(points) -> Float[Array, "n d"]:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .arguments import as_float, finite, instance, is_concrete, raise_at, whole
+from .arguments import as_float, finite, instance, is_concrete, raise_at, switched_off, whole
 from .build import build
 from .cloud import PointCloud
 from .neighbors import Neighbors, find_neighbors
@@ -134,7 +134,7 @@ def surface_divergence(
 
 def divergence_of(gradient: Stencil) -> Stencil:
     """The divergence, which has the weights of the gradient."""
-    known = (gradient.diagnostics, gradient.border)
+    known = (gradient.diagnostics, gradient.border, gradient.active)
     return Stencil(gradient.indices, gradient.weights, (), gradient.out_shape, *known)
 
 
@@ -178,9 +178,10 @@ def directional_derivative(
 def along(gradient: Stencil, direction: Float[Array, "*n d"]) -> Stencil:
     """The derivative along a vector field, from the gradient."""
     direction = _field(direction, (gradient.n, *gradient.out_shape), "direction")
-    direction = finite(direction, "direction").astype(gradient.weights.dtype)
-    weights = _along(direction, gradient.weights)
-    return Stencil(gradient.indices, weights, (), (), gradient.diagnostics, gradient.border)
+    direction = finite(direction, "direction", gradient.active).astype(gradient.weights.dtype)
+    weights = _along(switched_off(gradient.active, direction), gradient.weights)
+    known = (gradient.diagnostics, gradient.border, gradient.active)
+    return Stencil(gradient.indices, weights, (), (), *known)
 
 
 def diffusion(
@@ -229,10 +230,10 @@ def diffusion(
     scalar = d.ndim == 1
     stencil = build(cloud, neighbors, method, Laplacian() if scalar else Hessian(), throw)
     weigh = _scalar_weights if scalar else _tensor_weights
-    weights = weigh(
-        d.astype(stencil.weights.dtype), cloud.normals, stencil.indices, stencil.weights
-    )
-    return Stencil(stencil.indices, weights, (), (), stencil.diagnostics, stencil.border)
+    d = switched_off(cloud.active, d.astype(stencil.weights.dtype))
+    weights = weigh(d, cloud.seen.normals, stencil.indices, stencil.weights)
+    known = (stencil.diagnostics, stencil.border, stencil.active)
+    return Stencil(stencil.indices, weights, (), (), *known)
 
 
 def _checked_diffusivity(diffusivity, cloud) -> Float[Array, "*n"]:
@@ -241,10 +242,11 @@ def _checked_diffusivity(diffusivity, cloud) -> Float[Array, "*n"]:
     if d.shape not in ((n,), (n, dim, dim)):
         shapes = f"({n},) or ({n}, {dim}, {dim})"
         raise ValueError(f"diffusivity has shape {d.shape}, expected {shapes}")
-    finite(d, "diffusivity")
+    finite(d, "diffusivity", cloud.active)
     if not is_concrete(d, cloud.active):
         return d
-    values, on = np.asarray(d), cloud.host_active
+    on = cloud.host_active
+    values = np.where(np.expand_dims(on, tuple(range(1, d.ndim))), np.asarray(d), 0)
     if d.ndim == 1:
         raise_at(on & (values < 0), "diffusivity of point {i} is {v}, expected at least 0", values)
         return d

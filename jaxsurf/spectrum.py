@@ -82,8 +82,9 @@ def spectral_estimate(operator: AbstractOperator, *, steps: int = 40, degree: in
     steps, degree = whole(steps, "steps", least=8), whole(degree, "degree", least=1)
     if not is_concrete(*jax.tree.leaves(operator)):
         raise TypeError("operator is traced; its spectrum is estimated outside of jit and grad")
-    apply, scale = _scaled(operator)
-    n = operator.n
+    on = slice(None) if operator.active is None else np.flatnonzero(np.asarray(operator.active))
+    apply, scale = _scaled(operator, on)
+    n = len(np.arange(operator.n)[on])
     if scale == 0:
         return Spectrum(0.0, 0.0, 0.0)
     if n <= max(_DENSE, 2 * steps):
@@ -279,14 +280,20 @@ def _ellipse(values, hull, wanted: int, degree: int) -> tuple[float, float, int]
     return float(center[best[0], 0]), float(focus[best]), int(np.clip(enough, 1, degree))
 
 
-def _scaled(operator: AbstractOperator) -> tuple[Callable, float]:
-    """Products with the operator divided by a bound of its norm, in double precision; the bound."""
+def _scaled(operator: AbstractOperator, on) -> tuple[Callable, float]:
+    """Products with the operator divided by a bound of its norm, in double precision; the bound.
+
+    Of the points that are on.
+    """
     if isinstance(operator, Composition):
-        (outer, one), (inner, other) = _scaled(operator.outer), _scaled(operator.inner)
+        (outer, one), (inner, other) = _scaled(operator.outer, on), _scaled(operator.inner, on)
         return lambda v: outer(inner(v)), one * other
     matrix = operator.to_scipy().tocsr().astype(float)
+    if not isinstance(on, slice):
+        matrix = matrix[on][:, on]
     matrix.sum_duplicates()
-    bad = np.repeat(np.arange(operator.n), np.diff(matrix.indptr))[~np.isfinite(matrix.data)]
+    names = np.arange(operator.n)[on]
+    bad = np.repeat(names, np.diff(matrix.indptr))[~np.isfinite(matrix.data)]
     if bad.size:
         raise ValueError(f"operator has weights that are not finite at point {bad[0]}")
     largest = abs(matrix.data).max(initial=0)

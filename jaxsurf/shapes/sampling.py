@@ -207,18 +207,20 @@ def jitter(
     whole(seed, "seed", least=0)
     points = on_host(cloud.points, "cloud.points")
     normals = on_host(cloud.normals, "cloud.normals")
-    stays = np.zeros(cloud.n, bool)
+    on = cloud.host_active
+    stays = ~on
     if cloud.boundary is not None:
-        stays |= np.asarray(cloud.boundary)
-    if cloud.active is not None:
-        stays |= ~np.asarray(cloud.active)
+        stays = stays | np.asarray(cloud.boundary)
     # Not the stream of `default_rng(seed)`, from which the points themselves may have come.
     rng = np.random.default_rng((seed, 1))
-    direction = rng.normal(size=points.shape)
+    direction = rng.normal(size=points[on].shape)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    move = direction * (fraction * spacing * rng.random((cloud.n, 1)) ** (1 / cloud.dim))
-    points[~stays], normals[~stays] = _projected((points + move)[~stays], project)
-    new = PointCloud(jnp.asarray(points, cloud.points.dtype), jnp.asarray(normals))
+    length = fraction * spacing * rng.random((len(direction), 1)) ** (1 / cloud.dim)
+    moved = points.copy()
+    moved[on] += length * direction
+    points[~stays], normals[~stays] = _projected(moved[~stays], project)
+    x = jnp.asarray(points, cloud.points.dtype)
+    new = PointCloud(x, jnp.asarray(normals), active=cloud.active)
     return eqx.tree_at(lambda c: (c.points, c.normals), cloud, (new.points, new.normals))
 
 

@@ -99,7 +99,7 @@ def _weights(operator, total, preconditioner):
     options = {"preconditioner": Action(inverse, dtype)}
     solver = BiCGStab(_SOLVED * float(jnp.finfo(dtype).eps))
     sigma = jnp.asarray(system.sigma)
-    rhs = system.constant(-sigma * total / operator.n, dtype)
+    rhs = system.constant(-sigma * total / system.count, dtype)
 
     def solved(matrix, b):
         return lx.linear_solve(matrix, b, solver, options=options, throw=False).value

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import instance, is_concrete, real, whole
+from ..arguments import count_on, instance, is_concrete, real, switched_off, whole
 from ..boundary import Closure, check_border
 from ..stencils.algebra import AbstractOperator, check_scalar
 from . import invariant
@@ -107,8 +107,11 @@ def eigenmodes(
         instance(conditions, Closure, "conditions", "js.close(cloud, conditions) makes one")
     check_border(operator, conditions)
     k, degenerate = whole(k, "k"), float(real(degenerate, "degenerate", least=0, below=1))
-    if not 1 <= k <= operator.n // 2:
-        raise ValueError(f"k = {k} modes, between 1 and n / 2 = {operator.n // 2} can be computed")
+    n = operator.n
+    if is_concrete(operator.active):
+        n = int(count_on(operator.active, n))
+    if not 1 <= k <= n // 2:
+        raise ValueError(f"k = {k} modes, between 1 and n / 2 = {n // 2} can be computed")
     system = _System.of(operator, conditions)
     values, functions, *rest = _modes(system, k, degenerate)
     if conditions is not None:
@@ -125,8 +128,10 @@ class _System(eqx.Module):
     @staticmethod
     def of(operator: AbstractOperator, conditions: Closure | None) -> _System:
         if conditions is None:
-            return _System(operator, jnp.ones(operator.n, bool))
-        return _System(conditions.reduce(operator), _free(conditions))
+            on = operator.active
+            return _System(operator, jnp.ones(operator.n, bool) if on is None else on)
+        free = switched_off(operator.active, _free(conditions))
+        return _System(conditions.reduce(operator), free)
 
     def __call__(self, fields: Float[Array, "n c"]) -> Float[Array, "n c"]:
         return -self.operator(fields)
@@ -212,7 +217,10 @@ def _reference(system: _System, k: int) -> Float[Array, "n K"]:
     """
     n = system.operator.n
     kinds = [a.dtype for a in jax.tree.leaves(eqx.filter(system, eqx.is_inexact_array))]
-    return _noise(n, min(k + 8 + 2 * math.isqrt(k), n), jnp.result_type(*kinds))
+    noise = _noise(n, min(k + 8 + 2 * math.isqrt(k), n), jnp.result_type(*kinds))
+    on = system.operator.active
+    # As without those that are switched off.
+    return noise if on is None else noise[jnp.maximum(jnp.cumsum(on) - 1, 0)]
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))

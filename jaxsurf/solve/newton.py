@@ -13,7 +13,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ..arguments import as_float, is_concrete, whole, without_derivatives
+from ..arguments import as_float, is_concrete, switched_off, whole, without_derivatives
 from ..boundary import Closure
 from ..compiling import sized_jit
 from ..functions import canonical, numbers_as_arrays
@@ -104,6 +104,9 @@ def solve_nonlinear(
         raise ValueError(
             f"u0 has shape {u0.shape} and the right-hand side {rhs.shape}, expected ({operator.n},)"
         )
+    u0 = switched_off(operator.active, u0)
+    if rhs.ndim:
+        rhs = switched_off(operator.active, rhs)
     given = jax.eval_shape(lambda u: reaction(u, args), u0)
     if getattr(given, "shape", None) != u0.shape:
         shape = getattr(given, "shape", type(given).__name__)
@@ -156,12 +159,14 @@ class _Problem(eqx.Module):
         """P (f - L u - r(u)) at u = E v + e."""
         u = self.field(v)
         left = self.rhs - self.operator(u) - self.reaction(u, self.args)
+        left = switched_off(self.operator.active, left)
         return left if self.conditions is None else self.conditions.restrict(left)
 
     def slope(self, v):
         """r'(u)."""
         u = self.field(v)
-        return jax.jvp(lambda u: self.reaction(u, self.args), (u,), (jnp.ones_like(u),))[1]
+        slope = jax.jvp(lambda u: self.reaction(u, self.args), (u,), (jnp.ones_like(u),))[1]
+        return switched_off(self.operator.active, slope)
 
     def correction(self, v, residual, preconditioner, solver):
         """The solution of (L + r') delta = residual; what it is linearised at is a constant."""
@@ -188,7 +193,8 @@ def _solve(problem, u0, preconditioner, solver, rtol, atol, max_steps, concrete,
     loose = BiCGStab(_FORCING, 0.0, 1000) if solver is None else solver
     start = fixed.residual(jax.lax.stop_gradient(u0))
     size = jnp.linalg.norm(start)
-    source = jnp.linalg.norm(jnp.broadcast_to(fixed.rhs, u0.shape))
+    source = jnp.broadcast_to(fixed.rhs, u0.shape)
+    source = jnp.linalg.norm(switched_off(problem.operator.active, source))
     scale = jnp.maximum(size, source)
     target = jnp.maximum(rtol * scale, atol)
 

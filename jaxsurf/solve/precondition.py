@@ -11,12 +11,12 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float
 
-from ..arguments import instance
+from ..arguments import instance, switched_off
 from ..boundary import Closure
 from ..stencils.algebra import AbstractOperator, Composition, check_scalar
 from ..stencils.padded import PaddedMatrix
 from ..stencils.stencil import Stencil
-from .reduced import annihilates_constants, reduced_matrix
+from .reduced import annihilates_constants, free_points, reduced_matrix
 
 # The coarsest system has at most this many unknowns and is solved by a dense inverse.
 _COARSEST = 400
@@ -217,6 +217,7 @@ def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> 
     """
     _check_kinds(operator, conditions)
     diagonal = operator.diagonal
+    diagonal = switched_off(operator.active, diagonal, 1)
     if conditions is not None:
         diagonal = jnp.where(conditions.bound, 1, diagonal)
     return Jacobi(None, jax.lax.stop_gradient(diagonal))
@@ -273,23 +274,22 @@ def _check_kinds(operator, conditions) -> None:
 
 def _hierarchy(operator, conditions, single: bool) -> Multigrid:
     matrix = reduced_matrix(operator, conditions)
-    mean_zero = annihilates_constants(matrix, conditions)
+    free = free_points(operator, conditions)
+    mean_zero = annihilates_constants(matrix, free)
     dtype = np.dtype(np.float32) if single else matrix.dtype
     width = USED * operator.k if isinstance(operator, Stencil) else None
     levels = []
-    constant = np.ones(matrix.shape[0])
-    if conditions is not None:
-        constant[np.asarray(conditions.rows)] = 0
-    fine, room = matrix, matrix.shape[0]
+    constant = free.astype(float)
+    fine, room, on = matrix, matrix.shape[0], operator.active
     while room > _COARSEST:
         found = aggregate(fine, constant)
         if found is None:
             break
         tentative, constant = found
         coarse = room_for(tentative.shape[1], room)
-        level, fine = _level(fine, tentative, dtype, room, coarse, width)
+        level, fine = _level(fine, tentative, dtype, room, coarse, width, on)
         levels.append(level)
-        room, width = coarse, None
+        room, width, on = coarse, None, None
     if fine.shape[0] > 4 * _COARSEST:
         raise ValueError(
             f"coarsening stopped at {fine.shape[0]} unknowns: too few strong connections"
@@ -334,14 +334,14 @@ def aggregate(matrix, constant):
     return scipy.sparse.csr_matrix(tentative), coarse[:, 0]
 
 
-def _level(matrix, tentative, dtype, room: int, coarse: int, width):
+def _level(matrix, tentative, dtype, room: int, coarse: int, width, on):
     """A level, and the operator on the next one."""
     diagonal = matrix.diagonal()
     if np.any(diagonal == 0):
         i = int(np.flatnonzero(diagonal == 0)[0])
         raise ValueError(f"the diagonal of the operator is zero in row {i}: nothing to smooth with")
     inverse = 1 / divisor(matrix)
-    radius = jacobi_radius(matrix, inverse)
+    radius = jacobi_radius(matrix, inverse, on)
     prolong = smoothed(matrix, tentative, inverse, radius)
     restrict = prolong.T.tocsr()
     pad = lambda a, rows, width: PaddedMatrix.from_scipy(a, dtype, rows=rows, width=width)
@@ -387,9 +387,14 @@ def smoothed(matrix, tentative, inverse, radius) -> scipy.sparse.csr_matrix:
     return (tentative + damped @ tentative).tocsr()
 
 
-def jacobi_radius(matrix, inverse, steps: int = 8) -> float:
-    """Spectral radius of D⁻¹A by the power method; a few per cent too small."""
-    v = np.random.default_rng(0).normal(size=matrix.shape[0])
+def jacobi_radius(matrix, inverse, on=None, steps: int = 8) -> float:
+    """Spectral radius of D⁻¹A, of the points that are on, by the power method.
+
+    A few per cent too small.
+    """
+    v = np.zeros(matrix.shape[0])
+    rows = slice(None) if on is None else np.flatnonzero(np.asarray(on))
+    v[rows] = np.random.default_rng(0).normal(size=v[rows].size)
     for _ in range(steps):
         v = inverse * (matrix @ v)
         size = np.sqrt(np.sum(v * v))

@@ -14,7 +14,7 @@ _ROUNDOFF = 32
 
 
 def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
-    """P A E as a CSR matrix, zero in the rows of bound points.
+    """P A E as a CSR matrix, zero in the rows of bound and of switched-off points.
 
     Raises:
         ValueError: traced or non-finite weights.
@@ -33,12 +33,16 @@ def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
         if conditions.n != operator.n:
             raise ValueError(f"conditions for {conditions.n} points, the operator has {operator.n}")
         matrix = conditions.reduce(operator).to_scipy()
+    if operator.active is not None:
+        # In place: products change the order of the entries, and with it the aggregates.
+        matrix.data *= np.repeat(np.asarray(operator.active), np.diff(matrix.indptr))
+    if conditions is not None or operator.active is not None:
         matrix.eliminate_zeros()
     return matrix
 
 
 def reduced_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
-    """P A E with the identity at bound points, as a CSR matrix.
+    """P A E with the identity at points that are bound or switched off, as a CSR matrix.
 
     Raises:
         ValueError: traced or non-finite weights, or a zero row.
@@ -47,6 +51,12 @@ def reduced_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
     if conditions is not None:
         bound = np.asarray(conditions.bound).astype(matrix.dtype)
         matrix = (matrix + scipy.sparse.diags(bound)).tocsr()
+    if operator.active is not None:
+        off = np.flatnonzero(~np.asarray(operator.active))
+        place = matrix.indptr[off]
+        data, columns = np.insert(matrix.data, place, 1), np.insert(matrix.indices, place, off)
+        pointers = matrix.indptr + np.searchsorted(off, np.arange(len(matrix.indptr)))
+        matrix = scipy.sparse.csr_matrix((data, columns, pointers), shape=matrix.shape)
     empty = np.flatnonzero(np.diff(matrix.indptr) == 0)
     if empty.size:
         raise ValueError(
@@ -56,15 +66,20 @@ def reduced_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
     return matrix
 
 
-def annihilates_constants(matrix, conditions=None) -> bool:
+def free_points(operator, conditions) -> np.ndarray:
+    """Which points are switched on and not bound, on the host."""
+    free = np.ones(operator.n, bool) if operator.active is None else np.array(operator.active)
+    if conditions is not None:
+        free[np.asarray(conditions.rows)] = False
+    return free
+
+
+def annihilates_constants(matrix, free: np.ndarray) -> bool:
     """Whether the constants on the free points are in the null space, by the row sums.
 
     Raises:
         ValueError: they are on one of several disconnected parts.
     """
-    free = np.ones(matrix.shape[0], bool)
-    if conditions is not None:
-        free[np.asarray(conditions.rows)] = False
     # Entries of free rows are in free columns.
     sums = np.abs(np.add.reduceat(matrix.data, matrix.indptr[:-1]))
     sizes = np.add.reduceat(np.abs(matrix.data), matrix.indptr[:-1])

@@ -108,7 +108,7 @@ def shifted_multigrid(
     mass = scipy.sparse.identity(stiff.shape[0], stiff.dtype, format="csr")
     constant = np.ones(stiff.shape[0])
     width = USED * operator.k if isinstance(operator, Stencil) else None
-    room = stiff.shape[0]
+    room, on = stiff.shape[0], operator.active
     pairs = []
     while room > _COARSEST:
         found = aggregate(stiff, constant)
@@ -116,9 +116,9 @@ def shifted_multigrid(
             break
         tentative, constant = found
         coarse = room_for(tentative.shape[1], room)
-        pair, mass, stiff = _pair(mass, stiff, tentative, room, coarse, width)
+        pair, mass, stiff = _pair(mass, stiff, tentative, room, coarse, width, on)
         pairs.append(pair)
-        room, width = coarse, None
+        room, width, on = coarse, None, None
     # The unknowns that fill it up have the equation x = 0.
     mass, stiff = _dense(mass, room, 1), _dense(stiff, room, 0)
     return ShiftedMultigrid(tuple(pairs), jnp.asarray(mass), jnp.asarray(stiff))
@@ -131,11 +131,11 @@ def _dense(matrix, room: int, diagonal: float) -> np.ndarray:
     return dense
 
 
-def _pair(mass, stiff, tentative, room: int, coarse: int, width):
+def _pair(mass, stiff, tentative, room: int, coarse: int, width, on):
     """A level, and M and A on the next one."""
     below, beside = divisor(stiff), divisor(mass)
     inverse = np.divide(1, below, out=np.zeros_like(below), where=below != 0)
-    radius = jacobi_radius(stiff, inverse)
+    radius = jacobi_radius(stiff, inverse, on)
     prolong = smoothed(stiff, tentative, inverse, radius)
     restrict = prolong.T.tocsr()
     # In one complex matrix both get one layout.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,7 +9,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..arguments import as_float, is_concrete, whole, without_derivatives
+from ..arguments import as_float, count_on, is_concrete, switched_off, whole, without_derivatives
 from ..boundary import Closure
 from ..compiling import sized_jit
 from ..stencils.algebra import AbstractOperator
@@ -19,7 +17,7 @@ from ..stencils.lineax import Action
 from ..stencils.stencil import prepared
 from .krylov import BiCGStab, scale_of, tolerances_as_arrays
 from .precondition import AbstractPreconditioner, multigrid
-from .reduced import annihilates_constants, reduced_matrix
+from .reduced import annihilates_constants, free_points, reduced_matrix
 from .system import System, check_system, tolerance
 
 # An incompatible part may be this share of what of the right-hand side is not resolved,
@@ -107,6 +105,8 @@ def solve(
     check_system(operator, conditions, preconditioner, solver, atol)
     rhs = as_float(rhs, "right-hand side")
     rhs = rhs.astype(jnp.result_type(rhs, *jax.tree.leaves(operator), jnp.float32))
+    if rhs.shape[:1] == (operator.n,):
+        rhs = switched_off(operator.active, rhs)
     _check(operator, rhs, conditions)
     # What was not asked for may end at round-off.
     given, rtol = rtol is not None, tolerance(rtol, rhs.dtype)
@@ -151,7 +151,8 @@ def _solve_one(rhs, operator, conditions, preconditioner, solver, limits, mean_z
     v = found.value
     u = v if conditions is None else conditions.homogeneous(v) + offset
     if mean_zero:
-        u = u - jnp.mean(u)
+        u = u - jnp.sum(u) / count_on(operator.active, operator.n)
+        u = switched_off(operator.active, u)
     # Judged at size one, as squares of 1e-300 are zero; and whatever the solver says, by residuals.
     fixed, b, v = jax.lax.stop_gradient((system, known, v))
     scale = scale_of(b)
@@ -172,7 +173,8 @@ def _solve_one(rhs, operator, conditions, preconditioner, solver, limits, mean_z
     result = lx.RESULTS.where(reached, lx.RESULTS.successful, result)
     unresolved = fixed.mean(jnp.abs(products[:, 2] * fixed.spread()))
     allowed = jnp.minimum(_UNRESOLVED * unresolved, _CANCELLED * fixed.mean(jnp.abs(b)))
-    allowed = allowed + target / math.sqrt(operator.n)
+    count = jnp.asarray(count_on(operator.active, operator.n), target.dtype)
+    allowed = allowed + target / jnp.sqrt(count)
     torn = reached & ~project & mean_zero & (jnp.abs(incompatible) > allowed)
     result = lx.RESULTS.where(torn, lx.RESULTS.singular, result)
     result = lx.RESULTS.where(jnp.all(jnp.isfinite(known)), result, lx.RESULTS.nonfinite_input)
@@ -207,7 +209,8 @@ def _is_mean_zero(operator, conditions, preconditioner) -> bool:
             "whether the operator annihilates the constants is not to be seen on traced arrays: "
             "pass mean_zero=True or False, or a preconditioner made outside by js.multigrid"
         )
-    return annihilates_constants(reduced_matrix(operator, conditions), conditions)
+    free = free_points(operator, conditions)
+    return annihilates_constants(reduced_matrix(operator, conditions), free)
 
 
 def _check(operator, rhs, conditions) -> None:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float
 
-from ..arguments import instance, real
+from ..arguments import count_on, instance, real, switched_off
 from ..boundary import Closure, check_border
 from ..stencils.algebra import AbstractOperator, Composition, check_scalar
 from ..stencils.stencil import Stencil
@@ -24,7 +24,7 @@ class System(eqx.Module):
 
     Args:
         operator: A.
-        conditions: E, and P which keeps free points; None if all are free.
+        conditions: E, and P which keeps free points; None if all are free that are switched on.
         sigma: σ; None if the constants are not in the null space of P A E.
     """
 
@@ -45,13 +45,20 @@ class System(eqx.Module):
     @property
     def reduced(self) -> AbstractOperator:
         """P A E."""
-        return self.operator if self.conditions is None else self.conditions.reduce(self.operator)
+        operator = self.operator
+        if self.conditions is not None:
+            operator = operator @ self.conditions.extension
+        return operator if self._all_free else Projection(self) @ operator
+
+    @property
+    def _all_free(self) -> bool:
+        return self.conditions is None and self.operator.active is None
 
     @property
     def matrix(self) -> AbstractOperator:
         matrix = self.reduced
-        if self.conditions is not None:
-            matrix = matrix + (1 - self.conditions.restriction)
+        if not self._all_free:
+            matrix = matrix + (1 - Projection(self))
         return matrix if self.sigma is None else matrix - self.sigma * self.averaging
 
     def inverse(self, preconditioner: AbstractPreconditioner) -> AbstractOperator:
@@ -64,7 +71,7 @@ class System(eqx.Module):
     @property
     def averaging(self) -> Averaging:
         """p pᵀ / pᵀ p."""
-        return Averaging(self.operator.n, self.conditions)
+        return Averaging(self)
 
     def spread(self) -> Float[Array, "*n"]:
         """One over half the row sums of moduli: the square of a distance for a Laplacian."""
@@ -78,6 +85,7 @@ class System(eqx.Module):
 
     def free(self, v):
         """P v."""
+        v = switched_off(self.operator.active, v)
         return v if self.conditions is None else self.conditions.restrict(v)
 
     def constant(self, value, dtype):
@@ -86,29 +94,50 @@ class System(eqx.Module):
 
     def mean(self, v):
         """Over free points."""
-        return self.averaging.mean(v)
+        return jnp.sum(self.free(v)) / self.count
+
+    @property
+    def count(self):
+        """Number of free points."""
+        bound = 0 if self.conditions is None else self.conditions.m
+        return count_on(self.operator.active, self.operator.n) - bound
 
     def shift(self, v):
         r"""$-\sigma$ times the mean: where the system holds, $P A E v = f - p\,$ shift(v)."""
         return jnp.zeros((), v.dtype) if self.sigma is None else -self.sigma * self.mean(v)
 
 
-class Averaging(AbstractOperator):
-    """The mean over the free points, at each of these: symmetric, of rank one."""
+class Projection(AbstractOperator):
+    """P of a system: symmetric."""
 
-    n: int = eqx.field(static=True, default=0)
-    conditions: Closure | None = None
+    system: System
     in_shape = ()
     out_shape = ()
 
-    def mean(self, v):
-        count = self.n - (0 if self.conditions is None else self.conditions.m)
-        free = v if self.conditions is None else self.conditions.restrict(v)
-        return jnp.sum(free, axis=0) / count
+    @property
+    def n(self):
+        return self.system.operator.n
 
     def __call__(self, v):
-        v = jnp.broadcast_to(self.mean(v), v.shape)
-        return v if self.conditions is None else self.conditions.restrict(v)
+        return self.system.free(v)
+
+    def transpose(self):
+        return self
+
+
+class Averaging(AbstractOperator):
+    """p pᵀ / pᵀ p of a system, the mean at each free point: symmetric, of rank one."""
+
+    system: System
+    in_shape = ()
+    out_shape = ()
+
+    @property
+    def n(self):
+        return self.system.operator.n
+
+    def __call__(self, v):
+        return self.system.constant(self.system.mean(v), v.dtype)
 
     def transpose(self):
         return self

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import functools
 import math
 from collections.abc import Callable
 
@@ -72,6 +71,14 @@ class AbstractOperator(eqx.Module):
         """True at border points of the surface, which conditions should say something about.
 
         None on closed surfaces, and where it is not known.
+        """
+        return None
+
+    @property
+    def active(self) -> Bool[Array, " n"] | None:
+        """False at points that are switched off, whose values are zero before and after.
+
+        None if all are on.
         """
         return None
 
@@ -269,6 +276,10 @@ class Composition(AbstractOperator):
         return either(self.inner.border, self.outer.border)
 
     @property
+    def active(self):
+        return both(self.inner.active, self.outer.active)
+
+    @property
     def diagonal(self):
         if isinstance(self.outer, Diagonal):
             return self.outer.factor * self.inner.diagonal
@@ -327,6 +338,10 @@ class Sum(AbstractOperator):
         return either(self.one.border, self.other.border)
 
     @property
+    def active(self):
+        return both(self.one.active, self.other.active)
+
+    @property
     def diagonal(self):
         return self.one.diagonal + self.other.diagonal
 
@@ -369,6 +384,10 @@ class Transposed(AbstractOperator):
     @property
     def border(self):
         return self.operator.border
+
+    @property
+    def active(self):
+        return self.operator.active
 
     @property
     def diagonal(self):
@@ -427,8 +446,15 @@ def per_point(value: ArrayLike, n: int, name: str) -> Float[Array, "*n"]:
     return value
 
 
-def either(*borders):
-    """True where one of several masks is, of which each may be None."""
-    marked = [b for b in borders if b is not None]
-    both = (np if is_concrete(*marked) else jnp).logical_or
-    return functools.reduce(both, marked) if marked else None
+def either(one, other):
+    """True where one of two masks is, of which either may be None."""
+    if one is None or other is None or one is other:
+        return other if one is None else one
+    return (np if is_concrete(one, other) else jnp).logical_or(one, other)
+
+
+def both(one, other):
+    """True where two masks are, of which either may be None: true everywhere."""
+    if one is None or other is None or one is other:
+        return other if one is None else one
+    return (np if is_concrete(one, other) else jnp).logical_and(one, other)

@@ -12,8 +12,9 @@ import math
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from ..arguments import switched_off
 from ..compiling import is_quick
 
 # Slots added up in one pass over the memory of the result.
@@ -35,6 +36,7 @@ def product(
     u: Float[Array, "n *c"],
     contracted: int = 0,
     more: tuple[Int[Array, " e"], Int[Array, " e"], Float[Array, "*w e"]] | None = None,
+    active: Bool[Array, " n"] | None = None,
 ) -> Float[Array, "m *b"]:
     """The product with a field or a batch of fields.
 
@@ -44,10 +46,12 @@ def product(
         u: `(n, *batch, *in_shape)`.
         contracted: number of axes of `in_shape`.
         more: rows, points read and weights `(*out_shape, *in_shape, e)` of entries beside.
+        active: False at points that have no part in it; their results are zero.
 
     Returns:
         `(m, *batch, *out_shape)`.
     """
+    u = switched_off(active, u)
     n, components = len(u), u.shape[u.ndim - contracted :]
     batch = u.shape[1 : u.ndim - contracted]
     out_shape, m = weights.shape[1 : weights.ndim - 1 - contracted], weights.shape[-1]
@@ -64,7 +68,7 @@ def product(
         place = (*[slice(None)] * len(out_shape), rows)
         total = total.at[place].add(_term(entries, others, values, contracted))
     total = jnp.moveaxis(total.reshape(*out_shape, m, -1), -2, 0)
-    return jnp.moveaxis(total, -1, 1).reshape(m, *batch, *out_shape)
+    return switched_off(active, jnp.moveaxis(total, -1, 1).reshape(m, *batch, *out_shape))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3,))

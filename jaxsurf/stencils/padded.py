@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .gathers import constant_product, product, take
 
@@ -162,12 +162,14 @@ class Incoming(eqx.Module):
     Args:
         indices, weights: as of a stencil, `(k, n)` and `(k, *in_shape, *out_shape, n)`.
         extra: rows, columns and weights of entries that did not fit.
+        active: of the stencil.
         contracted: number of components axes that are summed over.
     """
 
     indices: Int[Array, "k n"]
     weights: Float[Array, "k *c n"]
     extra: tuple[Int[Array, " e"], Int[Array, " e"], Float[Array, "*c e"]]
+    active: Bool[Array, " n"] | None
     contracted: int = eqx.field(static=True)
 
     @classmethod
@@ -180,10 +182,10 @@ class Incoming(eqx.Module):
         diagonal = _exchanged(stencil.diagonal, contracted, 0)
         weights = weights.at[0].set(diagonal)
         extra = (table.rows, table.others, gathered(table.sources))
-        return cls(table.columns, weights, extra, contracted)
+        return cls(table.columns, weights, extra, stencil.active, contracted)
 
     def __call__(self, v: Float[Array, "n *c"]) -> Float[Array, "n *d"]:
-        return product(self.weights, self.indices, v, self.contracted, self.extra)
+        return product(self.weights, self.indices, v, self.contracted, self.extra, self.active)
 
 
 @functools.partial(jax.jit, static_argnums=1)

@@ -15,8 +15,8 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import is_array, is_concrete, mask, point_indices, raise_at
-from .algebra import AbstractOperator, Transposed, either, per_point
+from ..arguments import is_array, is_concrete, mask, point_indices, raise_at, switched_off
+from .algebra import AbstractOperator, Transposed, both, either, per_point
 from .gathers import product
 from .method import Diagnostics
 from .padded import Incoming, Table, table_of
@@ -35,6 +35,8 @@ class Stencil(AbstractOperator):
         in_shape: `()` for scalar fields, `(d,)` for a divergence.
         diagnostics: how well each stencil is determined; None if unknown.
         border: True at border points of the surface, `(n,)`; None if it has none.
+        active: False at points that are switched off, `(n,)`: what fields have there is not looked
+            at, results are zero; None if all are on.
         table: where the entries of the transpose stand, see `prepared`.
 
     A field of another precision than the weights is taken as JAX does: the result has the wider
@@ -58,6 +60,7 @@ class Stencil(AbstractOperator):
     in_shape: tuple[int, ...] = eqx.field(static=True, default=())
     diagnostics: Diagnostics | None = None
     border: Bool[Array, " n"] | None = None
+    active: Bool[Array, " n"] | None = None
     table: Table | None = None
 
     def __check_init__(self):
@@ -75,8 +78,9 @@ class Stencil(AbstractOperator):
                 # Those with diagnostics were looked at when they were built, or were not to be.
                 bad = ~np.isfinite(np.asarray(weights)).reshape(-1, self.n).all(axis=0)
                 raise_at(bad, "weights of point {i} are not finite", np.asarray(bad))
-        if is_array(self.border):
-            mask(self.border, self.n, "border")
+        for name in ("border", "active"):
+            if is_array(getattr(self, name)):
+                mask(getattr(self, name), self.n, name)
 
     def __repr__(self):
         filled = "" if self.diagnostics is None else f" ({_counts(self.diagnostics.count)} used)"
@@ -93,7 +97,8 @@ class Stencil(AbstractOperator):
         return self.indices.shape[0]
 
     def __call__(self, u):
-        return product(self.weights, self.indices, self.checked(u), len(self.in_shape))
+        contracted = len(self.in_shape)
+        return product(self.weights, self.indices, self.checked(u), contracted, None, self.active)
 
     def transpose(self) -> Transposed:
         """The transposed operator, which gathers too where the table of its entries is at hand.
@@ -114,7 +119,14 @@ class Stencil(AbstractOperator):
 
     def to_scipy(self):
         p, q, n = math.prod(self.out_shape), math.prod(self.in_shape), self.n
-        weights = np.asarray(self.weights).reshape(self.k, p, q, n).transpose(3, 1, 0, 2)
+        weights = np.asarray(self.weights)
+        if self.active is not None:
+            on = np.asarray(self.active)
+            used = np.expand_dims(
+                on & on[np.asarray(self.indices)], tuple(range(1, weights.ndim - 1))
+            )
+            weights = np.where(used, weights, 0)
+        weights = weights.reshape(self.k, p, q, n).transpose(3, 1, 0, 2)
         columns = np.asarray(self.indices).T[:, None, :, None] * q + np.arange(q)
         columns = np.broadcast_to(columns, weights.shape)
         # Rows stay in the order of the slots: to sort them takes longer than all the rest.
@@ -129,19 +141,22 @@ class Stencil(AbstractOperator):
         return _diagonal(self.weights, self.indices)
 
     def __rmul__(self, factor) -> Stencil:
-        factor = per_point(factor, self.n, "factor").astype(self.weights.dtype)
-        return self._with(self.weights * factor)
+        return self._with(self.weights * self._own(factor, "factor"))
 
     def __add__(self, other) -> AbstractOperator:
         # What the same slots can hold is one stencil again.
         if isinstance(other, Stencil) and self._has_slots_of(other):
-            border = either(self.border, other.border)
+            marks = either(self.border, other.border), both(self.active, other.active)
             weights, shapes = self.weights + other.weights, (self.out_shape, self.in_shape)
-            return Stencil(self.indices, weights, *shapes, None, border, self.table)
+            return Stencil(self.indices, weights, *shapes, None, *marks, self.table)
         if isinstance(other, AbstractOperator) or self.in_shape or not self._starts_with_centers:
             return super().__add__(other)
-        term = per_point(other, self.n, "term").astype(self.weights.dtype)
-        return self._with(self.weights.at[0].add(term))
+        return self._with(self.weights.at[0].add(self._own(other, "term")))
+
+    def _own(self, value, name: str):
+        """A number or one number per point, in the precision of the weights."""
+        value = per_point(value, self.n, name).astype(self.weights.dtype)
+        return switched_off(self.active, value) if value.ndim else value
 
     def _with(self, weights) -> Stencil:
         return eqx.tree_at(lambda s: s.weights, self, weights)
@@ -171,6 +186,8 @@ class Stencil(AbstractOperator):
             data |= {name: np.asarray(value) for name, value in vars(self.diagnostics).items()}
         if self.border is not None:
             data["border"] = np.asarray(self.border)
+        if self.active is not None:
+            data["active"] = np.asarray(self.active)
         with open(path, "wb") as file:
             np.savez(file, **data)  # type: ignore[arg-type]
 
@@ -188,10 +205,13 @@ class Stencil(AbstractOperator):
                 tuple(data.pop(name).tolist()) for name in ("out_shape", "in_shape")
             )
             indices, weights = jnp.asarray(data.pop("indices")), jnp.asarray(data.pop("weights"))
-            border = jnp.asarray(data.pop("border")) if "border" in data else None
+            border, active = (
+                jnp.asarray(data.pop(name)) if name in data else None
+                for name in ("border", "active")
+            )
             extra = {name: jnp.asarray(value) for name, value in data.items()}
             diagnostics = Diagnostics(**extra) if extra else None
-            return cls(indices, weights, out_shape, in_shape, diagnostics, border)
+            return cls(indices, weights, out_shape, in_shape, diagnostics, border, active)
         except FileNotFoundError:
             raise
         except _DAMAGE as error:

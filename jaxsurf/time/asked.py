@@ -17,7 +17,7 @@ from ..boundary import check_border
 from ..stencils.algebra import AbstractOperator
 from .coefficients import user
 from .pde import AbstractEvolution, AdvectionDiffusionReaction, WaveEquation
-from .states import dtype_of
+from .states import dtype_of, only_on
 
 
 def checked_state(problem: AbstractEvolution, u0: Any) -> PyTree[Array]:
@@ -37,7 +37,7 @@ def checked_state(problem: AbstractEvolution, u0: Any) -> PyTree[Array]:
         raise TypeError(f"u0 is a {type(u0).__name__}, a wave needs {want}: values and velocities")
     if n is not None and not pair and not hasattr(u0, "shape"):
         raise TypeError(f"u0 is a {type(u0).__name__}, expected {want}")
-    u0 = jax.tree.map(lambda leaf: as_float(leaf, "u0"), u0)
+    u0 = only_on(problem.active, jax.tree.map(lambda leaf: as_float(leaf, "u0"), u0))
     leaves = jax.tree.leaves(u0)
     if not leaves:
         raise TypeError(f"u0 holds no arrays, expected {want}")

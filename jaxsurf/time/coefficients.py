@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..arguments import as_float, finite, instance, is_concrete, raise_at, real
+from ..arguments import as_float, finite, instance, is_concrete, raise_at, real, switched_off
 from ..boundary import Closure
 from ..functions import numbers_as_arrays
 from ..stencils.algebra import AbstractOperator
@@ -28,8 +28,11 @@ def number(value: Any, name: str, least: float = -np.inf) -> Array:
     return numbers_as_arrays(_plain(real(value, name, least=least)))
 
 
-def coefficient(value: Any, name: str, least: float = -np.inf) -> Array | Callable:
+def coefficient(value: Any, name: str, least: float = -np.inf, on: Any = None) -> Array | Callable:
     """A number, an array in space, or a function of time, which stays as it is.
+
+    Args:
+        on: points that are switched on; None for all.
 
     Raises:
         TypeError: not of real numbers.
@@ -39,7 +42,9 @@ def coefficient(value: Any, name: str, least: float = -np.inf) -> Array | Callab
         return value
     if value is None or np.ndim(value) == 0:
         return number(value, name, least)
-    values = finite(as_float(value, name), name)
+    values = finite(as_float(value, name), name, on)
+    if on is not None and values.shape[:1] == on.shape:
+        values = switched_off(on, values, max(least, 0))
     if is_concrete(values):
         seen = np.asarray(values)
         low = np.any(np.less(seen, least).reshape(len(seen), -1), axis=1)
@@ -118,13 +123,15 @@ def check_closure(conditions: Any, n: int | None) -> None:
         raise ValueError(f"conditions are for {conditions.n} points, the operators have {n}")
 
 
-def check_mass(mass: Any, conditions: Closure | None, n: int | None) -> Float[Array, " n"] | None:
+def check_mass(
+    mass: Any, conditions: Closure | None, n: int | None, on: Any = None
+) -> Float[Array, " n"] | None:
     """The weights of the mass, as an array."""
     if mass is None:
         return None
     if conditions is not None:
         raise ValueError("`mass` is for closed systems: with boundary conditions it may change")
-    mass = finite(as_float(mass, "mass"), "mass")
+    mass = switched_off(on, finite(as_float(mass, "mass"), "mass", on))
     if mass.ndim != 1 or (n is not None and mass.shape != (n,)):
         raise ValueError(f"mass has shape {mass.shape}, expected ({'n' if n is None else n},)")
     if is_concrete(mass) and not bool(jnp.sum(mass) > 0):

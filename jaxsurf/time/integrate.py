@@ -3,6 +3,7 @@ r"""One call from a problem and a state to a solution in time."""
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
@@ -164,10 +165,11 @@ class _Steady(eqx.Module):
 
     rtol: Array
     atol: Array
+    norm: Callable = root_mean_square
 
     def __call__(self, t, y, args, *, terms, solver, **_):
         rate = solver.func(terms, t, y, args)
-        return root_mean_square(rate) < self.atol + self.rtol * root_mean_square(y)
+        return self.norm(rate) < self.atol + self.rtol * self.norm(y)
 
 
 # --- what came of it -----------------------------------------------------------------------

@@ -8,10 +8,12 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, PyTree
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from ..arguments import as_float, finite, instance, is_concrete
+from ..arguments import as_float, finite, instance, is_concrete, switched_off
 from ..boundary import Closure
+from ..operators import divergence_of
 from ..stencils.algebra import AbstractOperator
 from ..stencils.stencil import Stencil
 from .coefficients import (
@@ -24,6 +26,7 @@ from .coefficients import (
     number,
     user,
 )
+from .states import only_on
 
 Field = Float[Array, "n *c"]
 
@@ -67,6 +70,11 @@ class AbstractEvolution(eqx.Module):
     def contractive(self) -> bool:
         """True if no solution grows in the root mean square."""
         return False
+
+    @property
+    def active(self) -> Bool[Array | np.ndarray, " n"] | None:
+        """False at points that are switched off, as its operators say; None if all are on."""
+        return _known_active(*vars(self).values())
 
     def __repr__(self):
         """The parts that there are, in a line."""
@@ -114,11 +122,12 @@ class AbstractEvolution(eqx.Module):
         """The part for explicit steps: P (R(E u + e) + L e)."""
         rest = self.rest(t, self.closed(t, u), args)
         if self.conditions is None:
-            return rest
+            return self._free(rest)
         none = self.closed(t, jax.tree.map(jnp.zeros_like, u))
         return self._free(_add(rest, self.linear(t, none)))
 
     def _free(self, rate: PyTree[Field]) -> PyTree[Field]:
+        rate = only_on(self.active, rate)
         if self.conditions is None:
             return rate
         return jax.tree.map(self.conditions.restrict, rate)
@@ -192,10 +201,12 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         n = check_operator(gradient, "gradient", n, out=None)
         check_operator(stabilization, "stabilization", n)
         check_closure(conditions, n)
-        self.laplacian, self.diffusivity = laplacian, coefficient(diffusivity, "diffusivity", 0)
+        on = _known_active(laplacian, gradient, stabilization)
+        self.laplacian = laplacian
+        self.diffusivity = coefficient(diffusivity, "diffusivity", 0, on)
         self.reaction, self.stabilization = function(reaction, "reaction"), stabilization
         self.conservative, self.conditions = bool(conservative), conditions
-        self.mass = check_mass(mass, conditions, n)
+        self.mass = check_mass(mass, conditions, n, on)
         self.advection, self.gradient, self.velocity = None, None, None
         if velocity is not None:
             if gradient is None:
@@ -287,7 +298,7 @@ class BiharmonicDiffusion(AbstractEvolution):
         self.laplacian, self.conditions = laplacian, conditions
         self.stiffness = number(stiffness, "stiffness", 0)
         self.reaction = function(reaction, "reaction")
-        self.mass = check_mass(mass, conditions, n)
+        self.mass = check_mass(mass, conditions, n, laplacian.active)
 
     @property
     def diffusive(self):
@@ -362,7 +373,7 @@ class CahnHilliard(AbstractEvolution):
         self.width = number(width, "width", 0)
         self.mobility = number(mobility, "mobility", 0)
         self.splitting = number(splitting, "splitting", 0)
-        self.mass = check_mass(mass, conditions, n)
+        self.mass = check_mass(mass, conditions, n, laplacian.active)
 
     @property
     def diffusive(self):
@@ -434,7 +445,9 @@ class WaveEquation(AbstractEvolution):
         check_operator(stabilization, "stabilization", n)
         check_closure(conditions, n)
         self.laplacian, self.stabilization, self.conditions = laplacian, stabilization, conditions
-        self.speed, self.damping = coefficient(speed, "speed"), coefficient(damping, "damping")
+        on = laplacian.active
+        self.speed = coefficient(speed, "speed", on=on)
+        self.damping = coefficient(damping, "damping", on=on)
         self.forcing = function(forcing, "forcing")
 
     def closed(self, t, u):
@@ -464,6 +477,12 @@ class WaveEquation(AbstractEvolution):
 
 
 # --- pieces --------------------------------------------------------------------------------
+
+
+def _known_active(*parts) -> Bool[Array | np.ndarray, " n"] | None:
+    """What the first operator among them that knows says."""
+    known = [part.active for part in parts if isinstance(part, AbstractOperator)]
+    return next((active for active in known if active is not None), None)
 
 
 def _at(value: InTime, name: str, t):
@@ -533,13 +552,14 @@ def _along(gradient: Stencil, velocity, conservative: bool) -> Stencil:
     v = _checked_velocity(velocity, gradient)
     v = jnp.moveaxis(v[gradient.indices], -1, 1) if conservative else v.T[None]
     weights = jnp.sum(gradient.weights * v, axis=1)
-    return Stencil(gradient.indices, weights, (), (), gradient.diagnostics, gradient.border)
+    known = (gradient.diagnostics, gradient.border, gradient.active)
+    return Stencil(gradient.indices, weights, (), (), *known)
 
 
 def _advected(gradient: Stencil, velocity, u: Field, conservative: bool) -> Field:
     v = _per_point(_checked_velocity(velocity, gradient), u[..., None], keep=1)
     if conservative:
-        divergence = Stencil(gradient.indices, gradient.weights, (), gradient.out_shape)
+        divergence = divergence_of(gradient)
         return divergence(u[..., None] * v)
     return jnp.sum(gradient(u) * v, axis=-1)
 
@@ -548,4 +568,4 @@ def _checked_velocity(velocity, gradient: Stencil) -> Array:
     velocity, want = as_float(velocity, "velocity"), (gradient.n, *gradient.out_shape)
     if velocity.shape != want:
         raise ValueError(f"velocity has shape {velocity.shape}, expected {want}")
-    return finite(velocity, "velocity")
+    return switched_off(gradient.active, finite(velocity, "velocity", gradient.active))

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float
 
@@ -106,7 +107,8 @@ def step_preconditioner(problem: AbstractEvolution, u0: Float[Array, "n *c"]) ->
     laplacian = getattr(problem, "laplacian", None)
     if isinstance(problem, AdvectionDiffusionReaction) and laplacian is not None:
         d = problem.diffusivity
-        shifts = Partial(_diffusive, _mean(d(0.0) if callable(d) else d, jnp.shape(u0)[1:]))
+        d = d(0.0) if callable(d) else d
+        shifts = Partial(_diffusive, _mean(d, jnp.shape(u0)[1:], problem.active))
     elif isinstance(problem, BiharmonicDiffusion):
         shifts = Partial(_biharmonic, jnp.asarray(problem.stiffness))
     elif isinstance(problem, CahnHilliard):
@@ -125,9 +127,11 @@ def step_preconditioner(problem: AbstractEvolution, u0: Float[Array, "n *c"]) ->
     return StepPreconditioner(hierarchy, shifts, jnp.shape(u0))
 
 
-def _mean(diffusivity, species: tuple[int, ...]) -> Array:
-    """Over the points: a number, or one for every species."""
+def _mean(diffusivity, species: tuple[int, ...], on) -> Array:
+    """Over the points that are on: a number, or one for every species."""
     d = jnp.asarray(diffusivity)
+    if on is not None and d.shape[:1] == on.shape:
+        d = d[np.asarray(on)]
     if species and d.shape[-1:] == species:
         return jnp.mean(d.reshape(-1, *species), axis=0)
     return jnp.mean(d)

@@ -11,6 +11,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, PyTree
 
 from ..arguments import instance, is_concrete, real, whole
@@ -28,7 +29,7 @@ from .pde import (
     WaveEquation,
 )
 from .stability import Tableau, Verdict, check_steps, tableau_of
-from .states import root_mean_square
+from .states import Norm, root_mean_square
 
 _log = logging.getLogger(__name__)
 
@@ -191,12 +192,15 @@ def planned(
         solver = _looped(solver, adjoint)
     if controller is None and dt0 is None:
         _check_tolerances(rtol, atol, t0.dtype)
-        controller = dfx.PIDController(rtol, atol, dtmin=_shortest(t0, t1), force_dtmin=False)
+        shortest = _shortest(t0, t1)
+        controller = dfx.PIDController(rtol, atol, dtmin=shortest, force_dtmin=False)
     elif controller is None:
         controller = dfx.ConstantStepSize()
     saveat = check_saves(dfx.SaveAt(t1=True) if saveat is None else saveat, t0, t1)
     allowed = _allowed(max_steps, saveat, t0, t1, dt0, controller)
     check_coefficients(problem, t0, t1)
+    if problem.active is not None and getattr(controller, "norm", None) is optx.rms_norm:
+        controller = eqx.tree_at(lambda c: c.norm, controller, Norm(jnp.asarray(problem.active)))
     arrays = numbers_as_arrays(problem)
     now = (t0, u0, args)
     terms = _terms(arrays, solver, now)
@@ -334,6 +338,8 @@ def _ending(event: dfx.Event, problem: AbstractEvolution, now, told: dict) -> df
 
     def new(condition):
         if isinstance(condition, eqx.Module):  # has numbers of its own as leaves
+            if problem.active is not None and getattr(condition, "norm", None) is root_mean_square:
+                return eqx.tree_at(lambda c: c.norm, condition, Norm(jnp.asarray(problem.active)))
             return condition
         return _Ending(closed(problem, lambda t, y, args: condition(t, y, args, **told), now))
 

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..arguments import as_float, finite, instance, real, whole
+from ..arguments import as_float, finite, instance, real, switched_off, whole
 from ..cloud import PointCloud
-from ..neighbors import Neighbors, find_neighbors
+from ..neighbors import Neighbors, find_neighbors, switched_on
 from ..operators import diffusion
 from ..spectrum import spectral_estimate
 from ..stencils.algebra import AbstractOperator
@@ -110,14 +110,15 @@ def upwinding(
     """
     instance(cloud, PointCloud, "cloud")
     instance(method, AbstractMethod, "method", "like js.DCPSE(order=2)")
-    velocity = finite(as_float(velocity, "velocity"), "velocity")
+    velocity = finite(as_float(velocity, "velocity"), "velocity", cloud.active)
+    velocity = switched_off(cloud.active, velocity)
     if velocity.shape != cloud.points.shape:
         raise ValueError(f"velocity has shape {velocity.shape}, expected {cloud.points.shape}")
     real(strength, "strength", least=0)
-    spacing = cloud.spacing
+    spacing = cloud.seen.spacing
     if spacing is None:
         near = find_neighbors(cloud, 2, throw=False) if neighbors is None else neighbors
-        spacing = _nearest(cloud.points, near)
+        spacing = _nearest(cloud.seen.points, switched_on(cloud, near))
     viscosity = _viscosity(spacing, velocity, strength)
     return diffusion(cloud, viscosity, neighbors=neighbors, method=method)
 

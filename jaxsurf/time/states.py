@@ -5,7 +5,10 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from ..arguments import count_on, switched_off
 
 
 def length(y: PyTree[Array]) -> Float[Array, ""]:
@@ -16,6 +19,24 @@ def length(y: PyTree[Array]) -> Float[Array, ""]:
 def root_mean_square(y: PyTree[Array]) -> Float[Array, ""]:
     """Of all entries."""
     return length(y) / max(sum(leaf.size for leaf in jax.tree.leaves(y)), 1) ** 0.5
+
+
+def only_on(active: Bool[Array | np.ndarray, " n"] | None, tree: PyTree) -> PyTree:
+    """A state or a rate with zeros in the rows of points that are switched off."""
+    if active is None:
+        return tree
+    fields = lambda x: jnp.ndim(x) > 0 and jnp.shape(x)[0] == len(active)
+    return jax.tree.map(lambda x: switched_off(active, x) if fields(x) else x, tree)
+
+
+class Norm(eqx.Module):
+    """Root mean square over the points that are on."""
+
+    active: Bool[Array, " n"]
+
+    def __call__(self, y: PyTree[Array]) -> Float[Array, ""]:
+        share = count_on(self.active, 0) / len(self.active)
+        return root_mean_square(only_on(self.active, y)) / jnp.sqrt(share).astype(dtype_of(y))
 
 
 def frozen(tree: PyTree) -> PyTree:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .adapt import DOMINANCE, dominance, first_slots, is_better, share_wanted, sizes_to_try
-from .arguments import real, whole
+from .arguments import instance, real, whole
 from .build import stencil_weights
 from .cells import distance_key
 from .checks import DETOUR, LINK, RINGS, ring_size
@@ -32,6 +32,8 @@ from .stencils.targets import Laplacian
 _CHUNK, _SHEETS = 256, 16
 # Points whose neighbours reach farther than others' by so many standard deviations wait for that.
 _DEVIATIONS = 3.0
+# What numbers of candidates are rounded up to.
+_ROUND = 64
 # How much farther a wider search looks than even points would need.
 _SLACK = 1.1
 # What a code says of a point's list.
@@ -75,6 +77,13 @@ class NeighborSearch(eqx.Module):
     slots: int = eqx.field(static=True)
     tiers: tuple[Tier, Tier, Tier] = eqx.field(static=True)
 
+    def __check_init__(self):
+        instance(self.method, AbstractMethod, "method", "GFDM(degree=2), say")
+        if self.slots < self.k:
+            raise ValueError(f"slots = {self.slots}, for k = {self.k} neighbours at least {self.k}")
+        if len(self.tiers) != 3:
+            raise ValueError(f"tiers: {len(self.tiers)} searches, 3 are needed")
+
     @classmethod
     def allocated(
         cls,
@@ -96,8 +105,9 @@ class NeighborSearch(eqx.Module):
         def tier(wanted: int, least: int) -> Tier:
             wanted = min(wanted, available)
             reach = max(least, math.ceil(_SLACK * (wanted / usual) ** (1 / (d - 1))))
-            room = math.ceil(margin * int(jnp.max(_candidates(grid, reach))))
-            return Tier(wanted, reach, min(cloud.n, room))
+            room = min(cloud.n, math.ceil(margin * int(jnp.max(_candidates(grid, reach)))))
+            # Few sizes: surfaces of as many points share a program.
+            return Tier(wanted, reach, -(-room // _ROUND) * _ROUND)
 
         most = 2 * max(k, *sizes) if sizes else usual
         first = Tier(usual, 1, tier(0, 1).candidates)
@@ -123,20 +133,25 @@ def renewed(
             differentiated; all the rest is constant.
     """
     fixed = jax.tree.map(jax.lax.stop_gradient, cloud)
-    grid = _grid(fixed, _reach(fixed, before, search.k, search.tiers[0].k))
-    found, code = _usual(search, grid)
-    rings = _Rings.of(grid, found)
-    lists = _Lists(found.indices[: search.k], found.mask[: search.k], code)
-    lists = _apart(search, grid, rings, found, lists)
-    usual = _padded(lists, before, search.slots)
+    usual, code, (grid, rings) = usual_lists(search, fixed, before)
     built = operators(cloud, usual, search.method)
     if not search.sizes:
-        return usual, lists.code, built
-    lists = _Lists(usual.indices.T, usual.mask.T, lists.code)
+        return usual, code, built
+    lists = _Lists(usual.indices.T, usual.mask.T, code)
     lists, changed = _adapted(search, grid, rings, fixed, lists, built[0])
     adapted = _padded(lists, before, search.slots)
     again = lambda: operators(cloud, adapted, search.method)
     return adapted, lists.code, jax.lax.cond(changed, again, lambda: built)
+
+
+def usual_lists(search: NeighborSearch, cloud: PointCloud, before: Neighbors):
+    """Lists of the usual size, a code for each, and what others are found with."""
+    grid = _grid(cloud, _reach(cloud, before, search.k, search.tiers[0].k))
+    found, code = _usual(search, grid)
+    rings = _Rings.of(grid, found)
+    lists = _Lists(found.indices[: search.k], found.mask[: search.k], code)
+    lists = _apart(search, grid, rings, found, lists)
+    return _padded(lists, before, search.slots), lists.code, (grid, rings)
 
 
 class _Lists(eqx.Module):

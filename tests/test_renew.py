@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -93,3 +94,194 @@ def test_lists_sizes_and_operators_of_the_host(moving):
             laplacian.weights[:width], expected.weights, atol=1e-11 * size, rtol=1e-9
         )
         assert not laplacian.weights[width:].any()
+
+
+def toes(m=10, gap=2.4, thick=1.6):
+    """Two slabs side by side on a lattice: right sides of both face the same way."""
+    a = np.stack(np.meshgrid(np.arange(m), np.arange(m), indexing="ij"), -1).reshape(-1, 2)
+    faces = [0, thick, thick + gap, 2 * thick + gap]
+    x = np.concatenate([np.c_[np.full(m * m, f), a + 0.01 * i] for i, f in enumerate(faces)])
+    normals = np.repeat([-1.0, 1.0, -1.0, 1.0], m * m)[:, None] * [1.0, 0.0, 0.0]
+    return js.PointCloud(0.1 * x, normals), np.repeat(np.arange(4), m * m)
+
+
+@pytest.mark.filterwarnings("ignore:no neighbourhood", "ignore:the surface bends")
+def test_sheets_are_told_apart_as_on_the_host():
+    cloud, sheet = toes()
+    surface = js.discretize(cloud, method=METHOD)
+    search = surface.search(margin=2, slots=122)
+    for seed in (0, 1):
+        there = carried(functools.partial(smooth, seed=seed, size=0.02), cloud)
+        moved, _, code = found(surface, there, search)
+        anew = js.choose_neighbors(there, method=METHOD)
+        held = np.asarray(moved.neighbors.mask)
+        assert np.all((sheet[np.asarray(moved.neighbors.indices)] == sheet[:, None]) | ~held)
+        good = np.asarray(code) < 4
+        same = np.array([a == b for a, b in zip(lists(moved.neighbors), lists(anew))])
+        assert same[good].all()
+        assert good.all(), np.flatnonzero(~good)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_nearest_of_curves_and_of_lattices(dtype):
+    """Ties, up to round-off, are broken by the number of the point, in either precision."""
+    cloud, _ = toes(gap=5.0)
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    angle = 2 * np.pi * np.sort(np.random.default_rng(0).uniform(size=300))
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    for points, normals, k, reach in (
+        (cloud.points @ turn, cloud.normals @ turn, 20, 0.5),
+        (circle, circle, 9, 0.4),
+    ):
+        points, normals = jnp.asarray(points, dtype), jnp.asarray(normals, dtype)
+        rows = jnp.arange(len(points), dtype=jnp.int32)
+        host = js.find_neighbors(js.PointCloud(points, normals), k, throw=False)
+
+        @functools.partial(jax.jit, static_argnums=2)
+        def search(points, normals, few, rows=rows, k=k, reach=reach):
+            grid = Grid.of(points, normals, rows >= 0, jnp.asarray(reach, points.dtype))
+            return nearest_in(grid, rows, k, reach=1, count=192, few=few)
+
+        for few in (False, True):
+            result = search(points, normals, few)
+            assert not result.crowded.any() and result.mask.all()
+            np.testing.assert_array_equal(result.indices.T, host.indices)
+
+
+def test_what_has_no_room_or_is_out_of_reach_has_a_code():
+    cloud = jittered_sphere(600)
+    surface = js.discretize(cloud, method=METHOD)
+    normals, search = cloud.normals, surface.search(margin=1.2, slots=40)
+    call = jax.jit(lambda x, n: surface.moved(x, n, search=search))
+    code = jax.jit(lambda s: s.code)
+    still = call(cloud.points, normals)
+    assert not code(still).any()
+    # Ten times as many points within a cell, on a part of the surface.
+    near = (cloud.points[:, 2] > 0.5)[:, None]
+    top = jnp.array([0.0, 0.0, 1.0])
+    crowd = js.PointCloud(jnp.where(near, top + 0.2 * (cloud.points - top), cloud.points), normals)
+    crowded = call(crowd.points, normals)
+    assert (code(crowded) == 5).any()
+    kept = np.asarray(code(crowded)) == 5
+    usual = np.asarray(still.neighbors.indices)
+    np.testing.assert_array_equal(np.asarray(crowded.neighbors.indices)[kept][:, :36],
+                                  np.asarray(surface.neighbors.indices)[kept])  # fmt: skip
+    assert usual.shape == crowded.neighbors.indices.shape
+    with pytest.raises(ValueError, match=r"point \d+: more neighbours than there is room for"):
+        crowded.check()
+    # One point alone, far from all others.
+    lost = code(call(cloud.points.at[7].set(jnp.array([9.0, 0, 0])), normals))
+    assert lost[7] == 4 and (np.asarray(lost) > 0).sum() < 60
+    folded = cloud.points * jnp.where(cloud.points[:, :1] > 0, 1, -1) * jnp.array([1.0, 0.2, 1.0])
+    turned = jnp.where(cloud.points[:, :1] > 0, 1, -1) * normals
+    assert (code(call(folded, turned)) == 2).any()
+    assert code(call(cloud.points.at[3].set(jnp.nan), normals))[3] == 1
+    # Adapted neighbourhoods that the lists are too short for.
+    rough = random_sphere(600)
+    narrow = js.discretize(rough, js.find_neighbors(rough, 36), method=METHOD)
+    tight, wide = (narrow.search(margin=2, slots=s) for s in (36, 122))
+    assert (found(narrow, rough, tight)[2] == 5).any()
+    assert not found(narrow, rough, wide)[2].any()
+
+
+def test_kept_lists_reach_as_long_as_the_surface_is_not_stretched_one_way():
+    cloud = js.sphere(600)
+    surface = js.discretize(cloud, method=METHOD)
+    code = jax.jit(lambda x, n: surface.moved(x, n).code)
+
+    def stretched(factor):
+        return carried(lambda x: x * jnp.array([1.0, 1.0, factor]), cloud)
+
+    for there in (stretched(1.6), js.PointCloud(7 * cloud.points, cloud.normals)):
+        assert not code(there.points, there.normals).any()
+    # Along the equator, points come nearer across the stretched direction.
+    there = stretched(4.0)
+    equator = jnp.abs(cloud.points[:, 2]) < 0.3
+    assert (code(there.points, there.normals) == 4)[equator].all()
+    with pytest.raises(ValueError, match=r"point \d+: its list of neighbours no longer reaches"):
+        surface.moved(there.points, there.normals)
+    # In steps, each of which is short: what counts is where the lists were found.
+    step = surface
+    for factor in (1.6, 2.5):
+        there = stretched(factor)
+        step = eqx.filter_jit(lambda s, c: s.moved(c.points, c.normals))(step, there)
+    assert (step.code == 4).any()
+    # A search finds what is nearer now.
+    search = step.search(margin=6, slots=60)
+    moved, _, now = found(step, there, search)
+    assert not now.any()
+    assert lists(moved.neighbors) == lists(js.choose_neighbors(there, method=METHOD))
+
+
+def test_mapped_and_chained():
+    cloud = jittered_sphere(600)
+    surface = js.discretize(cloud, method=METHOD)
+    search = surface.search(margin=2, slots=54)
+    here, there = (carried(functools.partial(smooth, seed=2, size=s), cloud) for s in (0.0, 0.08))
+
+    def two_steps(first, second):
+        step = surface.moved(first.points, first.normals, search=search)
+        step = step.moved(second.points, second.normals, search=search)
+        return step.neighbors, step.code
+
+    plain, code = jax.jit(two_steps)(here, there)
+    assert not code.any()
+    assert lists(plain) == lists(js.choose_neighbors(there, method=METHOD))
+    stack = lambda *a: jnp.stack(a)
+    one, other = jax.tree.map(stack, here, there), jax.tree.map(stack, there, here)
+    several, codes = jax.jit(jax.vmap(two_steps))(one, other)
+    assert not codes.any()
+    np.testing.assert_array_equal(several.indices[0], plain.indices)
+    np.testing.assert_array_equal(several.mask[0], plain.mask)
+
+
+@pytest.mark.parametrize("make", [jittered_sphere, random_sphere])
+def test_derivatives_with_lists_that_are_found(make):
+    """In points and normals; of random points some lists are adapted."""
+    cloud = make(600)
+    surface = js.discretize(cloud, js.find_neighbors(cloud, 36), method=METHOD)
+    search = surface.search(margin=2, slots=122)
+    u = jnp.sin(cloud.points[:, 0])
+
+    def energy(points, normals):
+        normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+        moved = surface.moved(points, normals, search=search)
+        return jnp.stack([jnp.vdot(u, moved.laplacian(u)), jnp.sum(moved.gradient(u) ** 2)])
+
+    check_derivatives(energy, cloud.points, cloud.normals)
+
+
+def test_single_precision():
+    double = jittered_sphere(600)
+    cloud = js.PointCloud(*(jnp.asarray(a, jnp.float32) for a in (double.points, double.normals)))
+    surface = js.discretize(cloud, method=METHOD)
+    moved = surface.moved(2 * cloud.points, search=surface.search())
+    assert moved.laplacian.weights.dtype == jnp.float32
+    there = js.PointCloud(2 * cloud.points, cloud.normals)
+    assert lists(moved.neighbors) == lists(js.choose_neighbors(there, method=METHOD))
+
+
+@pytest.mark.filterwarnings("ignore:the surface bends", "ignore:no neighbourhood")
+@pytest.mark.parametrize("degree", [2, 4])
+def test_a_moved_cloud_is_as_stable_as_a_new_one(degree):
+    """No growing modes after smooth deformations of the stability study's clouds."""
+    method = js.GFDM(degree=degree)
+    many = random_sphere(4_000)
+    spread = js.poisson_disk(many.points, 0.12, normals=many.normals)
+    disk = js.PointCloud(many.points[spread], many.normals[spread])
+    for start in (jittered_sphere(500), random_sphere(500), disk):
+        surface = js.discretize(start, method=method)
+        search = surface.search(margin=3, slots=3 * surface.neighbors.k)
+        for seed in (0, 1):
+            there = carried(functools.partial(smooth, seed=seed, size=0.1), start)
+            _, laplacian, code = found(surface, there, search)
+            assert not code.any()
+            for operator in (laplacian, js.laplace_beltrami(there, method=method)):
+                values = scipy.linalg.eigvals(operator.to_scipy().toarray())
+                assert values.real.max() < 1e-8 * np.abs(values).max(), (seed, operator)
+
+
+def test_the_search_is_made_on_the_host():
+    surface = js.discretize(js.sphere(300), method=METHOD)
+    with pytest.raises(ValueError, match="search needs a concrete surface"):
+        eqx.filter_jit(lambda s: s.search())(surface)

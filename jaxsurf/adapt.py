@@ -58,7 +58,7 @@ def is_better(share, best, wanted) -> Bool[Array, " r"] | Bool[np.ndarray, " r"]
     return (best < DOMINANCE) & (share > best) & (share >= wanted)
 
 
-def first_slots(count: Any, mask) -> Bool[Array, "r k"] | Bool[np.ndarray, "r k"]:
+def first_slots(count: Any, mask) -> Bool[Array, "*r k"] | Bool[np.ndarray, "*r k"]:
     """The first slots of lists, as many as are counted for each row or for all."""
     return namespace(mask).arange(mask.shape[1]) < count
 

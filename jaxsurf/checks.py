@@ -155,7 +155,7 @@ def stands_above(squared, cosine, rise):
         cosine: between the normals.
         rise: the lesser of the heights over the two tangent planes.
     """
-    return (cosine > 0.9) & (rise > 0.9 * squared**0.5) & (squared > 0)
+    return (cosine > 0.9) & (rise * rise > 0.81 * squared) & (squared > 0)
 
 
 def ring_size(dim: int) -> int:

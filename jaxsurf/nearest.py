@@ -91,8 +91,10 @@ class Grid(eqx.Module):
         shift = start - (ends - length)
         more = jnp.diff(shift, axis=0)
         slot = jnp.arange(count, dtype=jnp.int32)[:, None]
-        passed = jnp.where(slot >= ends[:-1, None], more[:, None], 0)
-        return slot + shift[0] + jnp.sum(passed, axis=0), ends[-1]
+        place = slot + shift[0]
+        for end, step in zip(ends[:-1], more):
+            place = place + jnp.where(slot >= end, step, 0)
+        return place, ends[-1]
 
 
 def _folded(cell, wide: int):
@@ -116,7 +118,7 @@ class Nearest(eqx.Module):
         mask: which slots are filled.
         above: which of them lie on a sheet above or below the row's own.
         crowded: whether there was no room for all that were to be looked at.
-        all: whether no point was out of reach.
+        all: whether no point was out of reach; not known of searches that are not for few rows.
     """
 
     indices: Int[Array, "k r"]
@@ -151,7 +153,7 @@ def nearest_in(
 def _nearest(grid, rows, k, reach, count, min_cosine, few) -> Nearest:
     d = len(grid.cells)
     width = _power_of_two(k)
-    count = -(-count // width) * width
+    count = max(-(-count // width), 2) * width
     place, candidates = grid.candidates(rows, reach, count)
     take = lambda column: column.at[place].get(mode="clip")
     j = take(grid.order)
@@ -164,14 +166,15 @@ def _nearest(grid, rows, k, reach, count, min_cosine, few) -> Nearest:
     cosine = _dot(theirs[d:], own[d:])
     real = jnp.arange(count, dtype=jnp.int32)[:, None] < candidates
     near = key <= limit
-    every = jnp.all(near | ~real, axis=0) & (candidates == jnp.sum(grid.on))
+    # Where all rows are searched this is not asked, and would cost as much as all the rest.
+    every = candidates == jnp.sum(grid.on)
+    every = every & (jnp.all(near | ~real, axis=0) if few else False)
     good = near & (cosine >= min_cosine - cosine_slack(squared.dtype))
     good = (good | (j == rows)) & real
     rise = [jnp.abs(_dot(offset, normal)) for normal in (own[d:], theirs[d:])]
     above = stands_above(squared, cosine, jnp.minimum(*rise))
     key = jnp.where(good, jnp.where(j == rows, -1, key), _last(key.dtype))
-    # Without the barrier the compiler finds the keys again for every use of them.
-    keys = jax.lax.optimization_barrier(_packed(key, 2 * j + above, len(grid.order)))
+    keys = _packed(key, 2 * j + above, len(grid.order))
     keys = _sorted_few(keys, k) if few else _smallest(keys, width, k)
     key, low = _unpacked(keys)
     mask = key < _last(key.dtype)
@@ -211,11 +214,18 @@ def _sorted_few(keys, k: int):
 
 def _smallest(keys, width: int, k: int):
     """The k smallest along the first axis, in order, by Batcher's network of exchanges."""
-    size = 2
-    while size <= width:
-        keys = _merged(keys, size)
-        size *= 2
-    groups = [tuple(a[i : i + width] for a in keys) for i in range(0, len(keys[0]), width)]
+
+    def ordered(keys):
+        size = 2
+        while size <= width:
+            keys = _merged(keys, size)
+            size *= 2
+        return keys
+
+    # A loop over two groups or more: in one piece with what comes before, the compiler would find
+    # the keys again for every use of them.
+    parts = jax.lax.map(ordered, tuple(a.reshape(-1, width, *a.shape[1:]) for a in keys))
+    groups = [tuple(a[i] for a in parts) for i in range(len(parts[0]))]
     while len(groups) > 1:
         pairs = [
             _merged(_exchanged(low, tuple(a[::-1] for a in high))[0], width, first=False)

@@ -203,7 +203,7 @@ def _usual(search, grid) -> tuple[Nearest, Int[Array, " n"]]:
         lost = ~again.mask[search.k - 1] & ~again.all
         return again, jnp.where(again.crowded, CROWDED, jnp.where(lost, UNREACHED, 0))
 
-    short = grid.on & (code == 0) & ~found.mask[-1] & ~found.all
+    short = grid.on & (code == 0) & ~found.mask[-1]
     return _for_rows(short, look, (found, code))
 
 

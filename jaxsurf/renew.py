@@ -34,6 +34,8 @@ _CHUNK, _SHEETS = 256, 16
 _DEVIATIONS = 3.0
 # What numbers of candidates are rounded up to.
 _ROUND = 64
+# A list that reaches so many times as far as others' has lost a point.
+_LOST = 4.0
 # How much farther a wider search looks than even points would need.
 _SLACK = 1.1
 # What a code says of a point's list.
@@ -148,6 +150,8 @@ def usual_lists(search: NeighborSearch, cloud: PointCloud, before: Neighbors):
     """Lists of the usual size, a code for each, and what others are found with."""
     grid = _grid(cloud, _reach(cloud, before, search.k, search.tiers[0].k))
     found, code = _usual(search, grid)
+    on = True if cloud.active is None else cloud.active
+    code = jnp.where(on & ~grid.on, UNREACHED, code)  # not finite
     rings = _Rings.of(grid, found)
     lists = _Lists(found.indices[: search.k], found.mask[: search.k], code)
     lists = _apart(search, grid, rings, found, lists)
@@ -176,7 +180,10 @@ def _reach(cloud, before, k: int, usual: int):
     # Where there are fewer, as many more as a larger disc holds.
     far = jnp.sqrt(squared[0]) * (usual / jnp.maximum(count, 1)) ** (1 / (cloud.dim - 1))
     far = far.astype(x.dtype)
-    on = (count > 1) & jnp.isfinite(far)
+    on = (count > 1) & (far > 0) & jnp.isfinite(far)
+    # A point lost far away is in the lists of many.
+    low = jnp.mean(jnp.where(on, far, 1) ** -2.0, where=on) ** -0.5
+    on = on & (far < _LOST * low)
     mean = jnp.mean(far, where=on)
     most = jnp.minimum(
         jnp.max(far, where=on, initial=0), mean + _DEVIATIONS * jnp.std(far, where=on)

@@ -14,7 +14,10 @@ from jaxsurf.nearest import Grid, nearest_in
 
 from .helpers import check_derivatives, count_compilations, jittered_sphere, random_sphere
 
-pytestmark = pytest.mark.slow
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore:the surface bends", "ignore:no neighbourhood"),
+]
 
 METHOD = js.GFDM(degree=2)
 
@@ -68,7 +71,6 @@ def moving(request):
     return cloud, [functools.partial(smooth, seed=s, size=0.1) for s in (0, 1)]
 
 
-@pytest.mark.filterwarnings("ignore:the surface bends", "ignore:no neighbourhood")
 def test_lists_sizes_and_operators_of_the_host(moving):
     cloud, motions = moving
     surface = js.discretize(cloud, method=METHOD)
@@ -104,7 +106,6 @@ def toes(m=10, gap=2.4, thick=1.6):
     return js.PointCloud(0.1 * x, normals), np.repeat(np.arange(4), m * m)
 
 
-@pytest.mark.filterwarnings("ignore:no neighbourhood", "ignore:the surface bends")
 def test_sheets_are_told_apart_as_on_the_host():
     cloud, sheet = toes()
     surface = js.discretize(cloud, method=METHOD)
@@ -139,7 +140,7 @@ def test_nearest_of_curves_and_of_lattices(dtype):
         @functools.partial(jax.jit, static_argnums=2)
         def search(points, normals, few, rows=rows, k=k, reach=reach):
             grid = Grid.of(points, normals, rows >= 0, jnp.asarray(reach, points.dtype))
-            return nearest_in(grid, rows, k, reach=1, count=192, few=few)
+            return nearest_in(grid, rows, k, reach=1, count=400, few=few)
 
         for few in (False, True):
             result = search(points, normals, few)
@@ -212,26 +213,22 @@ def test_kept_lists_reach_as_long_as_the_surface_is_not_stretched_one_way():
     assert lists(moved.neighbors) == lists(js.choose_neighbors(there, method=METHOD))
 
 
-def test_mapped_and_chained():
-    cloud = jittered_sphere(600)
-    surface = js.discretize(cloud, method=METHOD)
-    search = surface.search(margin=2, slots=54)
-    here, there = (carried(functools.partial(smooth, seed=2, size=s), cloud) for s in (0.0, 0.08))
+def test_mapped():
+    """Also rows that are treated in loops: those of random points are adapted."""
+    cloud = random_sphere(600)
+    surface = js.discretize(cloud, js.find_neighbors(cloud, 36), method=METHOD)
+    search = surface.search(margin=2, slots=122)
 
-    def two_steps(first, second):
-        step = surface.moved(first.points, first.normals, search=search)
-        step = step.moved(second.points, second.normals, search=search)
-        return step.neighbors, step.code
+    def lists_of(there):
+        moved = surface.moved(there.points, there.normals, search=search)
+        return moved.neighbors, moved.code
 
-    plain, code = jax.jit(two_steps)(here, there)
-    assert not code.any()
-    assert lists(plain) == lists(js.choose_neighbors(there, method=METHOD))
-    stack = lambda *a: jnp.stack(a)
-    one, other = jax.tree.map(stack, here, there), jax.tree.map(stack, there, here)
-    several, codes = jax.jit(jax.vmap(two_steps))(one, other)
+    several = [carried(functools.partial(smooth, seed=2, size=s), cloud) for s in (0.0, 0.08)]
+    together, codes = jax.jit(jax.vmap(lists_of))(jax.tree.map(lambda *a: jnp.stack(a), *several))
     assert not codes.any()
-    np.testing.assert_array_equal(several.indices[0], plain.indices)
-    np.testing.assert_array_equal(several.mask[0], plain.mask)
+    for i, there in enumerate(several):
+        one = jax.tree.map(lambda a, i=i: a[i], together)
+        assert lists(one) == lists(js.choose_neighbors(there, method=METHOD))
 
 
 @pytest.mark.parametrize("make", [jittered_sphere, random_sphere])
@@ -247,7 +244,7 @@ def test_derivatives_with_lists_that_are_found(make):
         moved = surface.moved(points, normals, search=search)
         return jnp.stack([jnp.vdot(u, moved.laplacian(u)), jnp.sum(moved.gradient(u) ** 2)])
 
-    check_derivatives(energy, cloud.points, cloud.normals)
+    check_derivatives(energy, cloud.points, cloud.normals, step=1e-4)
 
 
 def test_single_precision():
@@ -260,7 +257,6 @@ def test_single_precision():
     assert lists(moved.neighbors) == lists(js.choose_neighbors(there, method=METHOD))
 
 
-@pytest.mark.filterwarnings("ignore:the surface bends", "ignore:no neighbourhood")
 @pytest.mark.parametrize("degree", [2, 4])
 def test_a_moved_cloud_is_as_stable_as_a_new_one(degree):
     """No growing modes after smooth deformations of the stability study's clouds."""

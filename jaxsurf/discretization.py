@@ -284,7 +284,7 @@ class Discretization(eqx.Module):
 
     # --- motion ----------------------------------------------------------------------------
 
-    def search(self, *, margin: float = 1.5, slots: int | None = None) -> NeighborSearch:
+    def search(self, *, margin: float = 1.25, slots: int | None = None) -> NeighborSearch:
         """Room to find neighbours in while the surface moves, for `moved`; concrete surfaces only.
 
         Args:

@@ -46,6 +46,7 @@ from .operators import surface_divergence as surface_divergence
 from .operators import surface_gradient as surface_gradient
 from .plot import plot_cloud as plot_cloud
 from .plot import plot_fields as plot_fields
+from .renew import NeighborSearch as NeighborSearch
 from .shapes.analytic import circle as circle
 from .shapes.analytic import ellipsoid as ellipsoid
 from .shapes.analytic import sphere as sphere

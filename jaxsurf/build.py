@@ -9,6 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from .adapt import (
+    DOMINANCE,
+    dominance,
+    first_slots,
+    is_better,
+    share_wanted,
+    sizes_to_try,
+)
+from .adapt import residual_tolerance as residual_tolerance
 from .arguments import instance, is_concrete, refuse
 from .arguments import mask as checked_mask
 from .cloud import PointCloud
@@ -20,10 +29,6 @@ from .stencils.method import AbstractMethod, Diagnostics, Neighborhood
 from .stencils.stencil import Stencil
 from .stencils.targets import Laplacian
 
-# A stencil is adapted if the weight of its centre is less than this share of all the others.
-_DOMINANCE = 0.2
-# Sizes of the neighbourhoods of such points, in units of the usual one: tried in turn.
-_SIZES = (1.5, 2.25, 3.4, 0.67, 0.45)
 # Stencils that are tried at a time: few shapes are ever compiled.
 _CHUNK = 256
 
@@ -174,25 +179,24 @@ def _adapted(cloud, method, throw, needed=True):
     neighbors = find_neighbors(cloud, k, throw=throw)
     _check_sizes(cloud, neighbors, method, Laplacian(), throw)
     found = stencil_weights(cloud, neighbors, method, Laplacian())
-    dominance = _dominance(*found)
-    poor = np.flatnonzero(on & needed & (dominance < _DOMINANCE))
-    need = method.basis_size(cloud.dim, Laplacian())
-    sizes = [min(int(k * size), available) for size in _SIZES if k * size > 1.5 * need]
+    share = _dominance(*found)
+    poor = np.flatnonzero(on & needed & (share < DOMINANCE))
+    sizes = sizes_to_try(method, cloud.dim, k, available)
     border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
-    if not poor.size or max(sizes, default=0) <= k:
-        _report(poor, dominance[poor], border, np.full(poor.size, k), method)
+    if not poor.size or not sizes:
+        _report(poor, share[poor], border, np.full(poor.size, k), method)
         return neighbors, found
 
     # Filled up with copies, so that few shapes are ever compiled.
     rows = np.resize(poor, -(-poor.size // _CHUNK) * _CHUNK)
     indices, mask = nearest_of(cloud, rows, max(sizes))
-    chosen, best = np.full(rows.size, k), dominance[rows]
+    chosen, best = np.full(rows.size, k), share[rows]
     kept = [_wider(np.asarray(a)[..., rows], max(sizes)) for a in jax.tree.leaves(found)]
-    wanted = np.where(border & (dominance > -np.inf), _DOMINANCE, -np.inf)[rows]
+    wanted = share_wanted(border, share)[rows]
     for size in sizes:
-        trial = _in_chunks(cloud, indices, mask & _first(size, mask), method, rows)
+        trial = _in_chunks(cloud, indices, mask & first_slots(size, mask), method, rows)
         now = _dominance(*trial)
-        better = (best < _DOMINANCE) & (now > best) & (now >= wanted)
+        better = is_better(now, best, wanted)
         best = np.where(better, now, best)
         chosen = np.where(better, size, chosen)
         kept = [np.where(better, new, old) for new, old in zip(jax.tree.leaves(trial), kept)]
@@ -204,7 +208,7 @@ def _adapted(cloud, method, throw, needed=True):
     all_mask = np.pad(np.asarray(neighbors.mask), ((0, 0), (0, widest - k)))
     changed = chosen != k
     where = rows[changed]
-    all_mask[where] = (mask & _first(chosen[:, None], mask))[changed, :widest]
+    all_mask[where] = (mask & first_slots(chosen[:, None], mask))[changed, :widest]
     all_indices[where] = np.where(all_mask[where], indices[changed, :widest], where[:, None])
 
     def put(old, new):
@@ -235,36 +239,23 @@ def _in_chunks(cloud, indices, mask, method, rows):
 
 def _report(poor, best, border, chosen, method) -> None:
     """Warn of points inside the surface where no size serves."""
-    failed = (best < _DOMINANCE) & ~border[poor]
+    failed = (best < DOMINANCE) & ~border[poor]
     if failed.any():
         worst = np.flatnonzero(failed)[np.argmin(best[failed])]
         warnings.warn(
             f"no neighbourhood of {failed.sum()} points serves {method}: the worst is point "
             f"{poor[worst]}, where the centre has a share of {best[worst]:.2g} of the weights of "
-            f"{chosen[worst]} neighbours, {_DOMINANCE} is needed; the operator may have growing "
+            f"{chosen[worst]} neighbours, {DOMINANCE} is needed; the operator may have growing "
             "modes (js.spectral_estimate)",
             stacklevel=4,
         )
 
 
-def _first(count, mask: np.ndarray) -> np.ndarray:
-    return np.arange(mask.shape[1]) < count
-
-
 def _dominance(weights, diagnostics) -> np.ndarray:
-    """Share of the centre among the absolute weights of the others; of no use where -inf."""
-    weights, residual = np.asarray(weights), np.asarray(diagnostics.residual)
-    others = np.sum(np.abs(weights[1:]), axis=0)
-    share = np.divide(-weights[0], others, out=np.full(len(others), -np.inf), where=others > 0)
-    return np.where(residual < residual_tolerance(weights.dtype), share, -np.inf)
+    return np.asarray(dominance(np.asarray(weights), np.asarray(diagnostics.residual)))
 
 
 # --- checks --------------------------------------------------------------------------------
-
-
-def residual_tolerance(dtype) -> float:
-    """Largest relative moment residual of a stencil that counts as determined."""
-    return float(np.finfo(dtype).eps) ** 0.5
 
 
 def _check_sizes(cloud, neighbors, method, target, throw) -> None:

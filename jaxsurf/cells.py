@@ -204,7 +204,7 @@ def _search(
     radius = jax.lax.stop_gradient(radius)
     on = _all_on(points, active)
     start, length, order = _candidates(points, radius, on)
-    limit = _distance_key(radius * radius)
+    limit = distance_key(radius * radius)
     last = jnp.iinfo(limit.dtype).max
 
     def row(i, start, length):
@@ -215,7 +215,7 @@ def _search(
         cell = jnp.minimum(cell, len(length) - 1)
         j = order.at[(start - (ends - length))[cell] + t].get(mode="clip")
         d = points[j] - points[i]
-        key = _distance_key(jnp.sum(d * d, axis=1))
+        key = distance_key(jnp.sum(d * d, axis=1))
         good = (t < ends[-1]) & (key <= limit) & on[i]
         if normals is not None:
             good &= jnp.sum(normals[j] * normals[i], axis=1) >= (
@@ -275,7 +275,7 @@ def _pad(row, width: int, value):
     return jnp.pad(row, (0, width - len(row)), constant_values=value) if len(row) < width else row
 
 
-def _distance_key(squared: Array) -> Array:
+def distance_key(squared: Array) -> Array:
     """The same integers as `neighbors.distance_key`."""
     if squared.dtype == jnp.float32:
         return (jax.lax.bitcast_convert_type(squared, jnp.int32) + (1 << 7)) >> 8

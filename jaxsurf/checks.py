@@ -16,6 +16,9 @@ _GAP = 0.1
 # Two points farther apart than this many spacings are not linked by the surface between them,
 # and no narrower gap between sheets of the same orientation is one.
 LINK = 2.0
+# A way along the surface longer than this times the chord leads around a gap; around a right
+# angle it is at most 1.41.
+DETOUR = 1.5
 
 
 def check_count(k: int, n: int) -> None:
@@ -138,11 +141,26 @@ def two_sheets(points, normals, slots, rows) -> np.ndarray:
     above = np.zeros(slots.shape, bool)
     for column, slot in zip(above.T, slots.T, strict=True):  # (n, k, d) arrays would be large
         d, theirs = points[slot] - here, normals[slot]
-        distance = np.linalg.norm(d, axis=1)
         rise = np.minimum(*(np.abs(np.einsum("nd,nd->n", d, m)) for m in (mine, theirs)))
-        parallel = np.einsum("nd,nd->n", mine, theirs) > 0.9
-        column[:] = parallel & (rise > 0.9 * distance) & (distance > 0)
+        cosine = np.einsum("nd,nd->n", mine, theirs)
+        column[:] = stands_above(np.einsum("nd,nd->n", d, d), cosine, rise)
     return above
+
+
+def stands_above(squared, cosine, rise):
+    """Whether points at some distance lie above or below one, on a sheet parallel to its own.
+
+    Args:
+        squared: of the distance.
+        cosine: between the normals.
+        rise: the lesser of the heights over the two tangent planes.
+    """
+    return (cosine > 0.9) & (rise * rise > 0.81 * squared) & (squared > 0)
+
+
+def ring_size(dim: int) -> int:
+    """A point and its closest neighbours: two of a curve, four of a surface."""
+    return 2 * dim - 1
 
 
 def query(tree: cKDTree, points: np.ndarray, count: int) -> np.ndarray:

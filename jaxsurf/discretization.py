@@ -19,8 +19,9 @@ from .cloud import PointCloud
 from .compiling import copying_jit
 from .fits.monomials import polynomial_count
 from .interpolation import interpolated
-from .motion import CODES, carried, judged
+from .motion import CODES, carried, folded, judged, unreached
 from .neighbors import Neighbors, switched_on
+from .renew import NeighborSearch, renewed
 from .stencils.algebra import Composition
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod
@@ -66,6 +67,8 @@ class Discretization(eqx.Module):
         neighbors: of every point.
         method: how weights are computed.
         border: the marked border of the cloud; None if it is closed.
+        found_at: where the points were when their neighbours were found; None if where they are.
+        found: what was wrong then, as in `code`; None if nothing.
 
     Example:
         >>> surface = js.discretize(js.torus(1_000, 1.0, 0.4), method=js.GFDM(degree=4))
@@ -77,6 +80,8 @@ class Discretization(eqx.Module):
     neighbors: Neighbors
     method: AbstractMethod
     border: Border | None = None
+    found_at: Float[Array, "n d"] | None = None
+    found: Int[Array, " n"] | None = None
 
     def __check_init__(self):
         if not isinstance(self.cloud, PointCloud):
@@ -253,33 +258,63 @@ class Discretization(eqx.Module):
 
     # --- motion ----------------------------------------------------------------------------
 
+    def search(self, *, margin: float = 1.25, slots: int | None = None) -> NeighborSearch:
+        """Room to find neighbours in while the surface moves, for `moved`; concrete surfaces only.
+
+        Args:
+            margin: factor on what these points need. Where points crowd, or where the neighbours
+                that a point had are spread, more is needed; a code says where it is not enough.
+            slots: of the new lists, which bound the neighbourhoods that points are given; as many
+                as the lists of this surface have if None. All operators are as wide.
+
+        Raises:
+            TypeError: a margin that is no number, slots that are not a whole number.
+            ValueError: a margin below 1, fewer slots than the method asks for; a traced surface.
+        """
+        if not is_concrete(*jax.tree.leaves(self)):
+            raise ValueError("search needs a concrete surface: call it outside jit")
+        return NeighborSearch.allocated(self.cloud, self.neighbors, self.method, margin, slots)
+
     def moved(
-        self, points: Float[Array, "n d"], normals: Float[Array, "n d"] | None = None
+        self,
+        points: Float[Array, "n d"],
+        normals: Float[Array, "n d"] | None = None,
+        *,
+        search: NeighborSearch | None = None,
     ) -> Discretization:
-        r"""The same surface with its points elsewhere: same neighbours, border, mask and method.
+        r"""The same surface with its points elsewhere: same border, mask and method.
 
         Args:
             points: new positions, `(n, d)`; switched-off ones stay where they are.
             normals: new unit normals; if None those of the tangents carried along by the motion,
                 $n \propto F t_1 \times F t_2$ with F the gradient of the new positions on the
                 surface as it was.
+            search: finds the neighbours anew and adapts them, as `choose_neighbors` does, in
+                compiled code; from `Discretization.search`. If None they are the same as before.
 
         Returns:
-            The moved surface. Its spacing, if it has one, is stretched with its area.
+            The moved surface. Its spacing, if it has one, is stretched with its area. A row for
+            which a search has no room keeps the neighbours it had, and a code says so.
 
         Accuracy: normals as `gradient`, $O(h^p)$; of rotations and changes of scale to round-off
-            (`tests/test_discretization.py::test_moved_surfaces_are_new_ones`).
+            (`tests/test_discretization.py::test_moved_surfaces_are_new_ones`). Neighbours found
+            are those of `choose_neighbors` up to distances that round-off decides, where their
+            code is 0 (`tests/test_renew.py`).
         Differentiable: forward and reverse, in the points and normals given and in those of the
-        surface as it was.
+            surface as it was; for fixed neighbours, or for those that a search finds.
         Raises:
+            TypeError: a search that is none.
             ValueError: wrong shapes; on concrete arrays points that are not finite or coincide,
-                or that fold the surface. Under `jit`, `vmap` and `grad` see `code`.
+                that fold the surface, or that their lists do not serve. Under `jit`, `vmap` and
+                `grad` see `code`.
         """
         points = as_float(points, "points")
         if points.shape != self.cloud.points.shape:
             raise ValueError(
                 f"points have shape {points.shape}, expected {self.cloud.points.shape}"
             )
+        if search is not None:
+            instance(search, NeighborSearch, "search", "see Discretization.search")
         active, spacing = self.cloud.active, self.cloud.spacing
         if active is not None:
             points = jnp.where(active[:, None], points, self.cloud.points)
@@ -300,9 +335,31 @@ class Discretization(eqx.Module):
             active=active,
             spacing=spacing,
         )
-        surface = Discretization(cloud, self.neighbors, self.method, self.border)
+        if search is None:
+            found_at = self.cloud.points if self.found_at is None else self.found_at
+            surface = Discretization(
+                cloud,
+                self.neighbors,
+                self.method,
+                self.border,
+                jax.lax.stop_gradient(found_at),
+                self.found,
+            )
+        else:
+            surface = self._renewed(cloud, search)
         if is_concrete(*jax.tree.leaves(surface)):
             surface.check()
+        return surface
+
+    def _renewed(self, cloud: PointCloud, search: NeighborSearch) -> Discretization:
+        """The surface of another cloud of the same points, with neighbours of its own."""
+        neighbors, found, operators = renewed(search, cloud, self.neighbors, _operators)
+        # What has turned no list found anew would hold.
+        found = jnp.where(folded(cloud, self.neighbors), 2, found)
+        surface = Discretization(cloud, neighbors, search.method, self.border, found=found)
+        name = "_joint" if search.method.shares_moments else "_laplacian"
+        kept = operators if search.method.shares_moments else operators[0]
+        object.__setattr__(surface, "_kept", {name: kept})
         return surface
 
     @_Kept
@@ -310,18 +367,26 @@ class Discretization(eqx.Module):
         """What is wrong with each point: what would be an error outside `jit`, as a number.
 
         0: nothing. 1: its position or normal is not finite. 2: the normal of a neighbour next to it
-        points to the other side. 3: its stencil is degenerate.
+        points to the other side. 3: its stencil is degenerate. 4: its list no longer reaches: since
+        the list was found the surface was stretched so differently in different directions that a
+        point outside may be less than half as far as one in it; or a search did not find enough
+        neighbours as far as it looks. 5: more neighbours than a search has room for.
         """
         diagnostics = self.laplacian.diagnostics
         assert diagnostics is not None
         code = judged(self.cloud, self.neighbors, diagnostics.residual)
+        if self.found_at is not None:
+            far = unreached(self.found_at, self.cloud.points, self.neighbors)
+            code = jnp.where((code == 0) & far, 4, code)
+        if self.found is not None:
+            code = jnp.where((self.found > 0) & ((code == 0) | (code > 2)), self.found, code)
         return jax.lax.stop_gradient(code)
 
     def check(self) -> None:
-        """Raise a ValueError that names the first point whose `code` is not 0; concrete only."""
+        """Raise a ValueError that names the first point of the least `code` above 0; not traced."""
         code = np.asarray(self.code)
-        names = np.array([CODES.get(int(c), "") for c in code])
-        raise_at(code != 0, "point {i}: {v}", names)
+        least = np.min(code, where=code > 0, initial=max(CODES))
+        raise_at(code == least, f"point {{i}}: {CODES[int(least)]}", code)
 
 
 def discretize(
@@ -363,6 +428,12 @@ def discretize(
     if cloud.boundary is not None and (np.asarray(cloud.boundary) & cloud.host_active).any():
         border = find_border(cloud)
     return Discretization(cloud, neighbors, method, border)
+
+
+def _operators(cloud, neighbors, method) -> tuple[Stencil, ...]:
+    """The Laplacian, and what comes with it for nothing."""
+    surface = Discretization(cloud, neighbors, method)
+    return surface._joint if method.shares_moments else (surface._laplacian,)
 
 
 @copying_jit

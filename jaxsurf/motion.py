@@ -15,7 +15,11 @@ CODES = {
     1: "its position or normal is not finite",
     2: "the normal of a neighbour next to it points to the other side",
     3: "its stencil is degenerate",
+    4: "its list of neighbours no longer reaches",
+    5: "more neighbours than there is room for",
 }
+# Points outside a list may come as near as this share of the way to the farthest one in it.
+_SKIN = 0.5
 
 # Each brings normals closer to where a rigid motion takes them, by the error of the gradient.
 _TURNS = 4
@@ -66,8 +70,17 @@ def _crossed(tangents):
 
 @jax.jit
 def judged(cloud, neighbors, residual):
+    """Codes of points: not finite, folded, degenerate."""
+    ill = ~jnp.all(jnp.isfinite(cloud.points) & jnp.isfinite(cloud.normals), axis=1)
+    poor = ~(residual < residual_tolerance(residual.dtype))
+    code = jnp.where(ill, 1, jnp.where(folded(cloud, neighbors), 2, jnp.where(poor, 3, 0)))
+    return jnp.where(neighbors.mask[:, 0], code, 0)
+
+
+@jax.jit
+def folded(cloud, neighbors):
+    """Whether the normal of a neighbour next to a point points to the other side."""
     points, normals = cloud.points, cloud.normals
-    ill = ~jnp.all(jnp.isfinite(points) & jnp.isfinite(normals), axis=1)
 
     def turned(found, slot):
         index, used = slot
@@ -76,7 +89,27 @@ def judged(cloud, neighbors, residual):
     # Of those farther away, other lists would leave out what has turned.
     ring = 2 * points.shape[1] + 1
     lists = (neighbors.indices[:, 1:ring].T, neighbors.mask[:, 1:ring].T)
-    folded = jax.lax.scan(turned, jnp.zeros(len(points), bool), lists)[0]
-    poor = ~(residual < residual_tolerance(residual.dtype))
-    code = jnp.where(ill, 1, jnp.where(folded, 2, jnp.where(poor, 3, 0)))
-    return jnp.where(neighbors.mask[:, 0], code, 0)
+    return jax.lax.scan(turned, jnp.zeros(len(points), bool), lists)[0]
+
+
+@jax.jit
+def unreached(before, after, neighbors):
+    """Whether points outside a list may have come nearer than those in it.
+
+    They were at least as far as the farthest of the list. They came nearer by no other factor
+    than those that are nearly as far, if the motion is smooth.
+    """
+    slots = (neighbors.indices.T, neighbors.mask.T)
+
+    def distances(slot):
+        index, used = slot
+        return tuple(
+            jnp.where(used, jnp.sqrt(jnp.sum((x[index] - x) ** 2, axis=1)), 0)
+            for x in (before, after)
+        )
+
+    old, new = jax.lax.map(distances, slots)
+    farthest = jnp.max(old, axis=0)
+    outer = (old > 0.5 * farthest) & (old > 0)
+    stretch = jnp.min(jnp.where(outer, new / jnp.where(outer, old, 1), jnp.inf), axis=0)
+    return stretch * farthest < _SKIN * jnp.max(new, axis=0)

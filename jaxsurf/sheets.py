@@ -7,11 +7,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from .checks import LINK, RINGS, query
-
-# A way along the surface longer than this times the chord leads around a gap; around a right
-# angle it is at most 1.41.
-_DETOUR = 1.5
+from .checks import DETOUR, LINK, RINGS, query, ring_size
 
 
 def distance_key(squared: np.ndarray) -> np.ndarray:
@@ -77,7 +73,7 @@ def without_islands(
         place = np.searchsorted(members, found)
         way = dijkstra(links[place][:, place], directed=False, indices=0)
         chord = np.linalg.norm(points[found] - points[rows[i]], axis=1)
-        kept = found[way <= _DETOUR * chord][:k]
+        kept = found[way <= DETOUR * chord][:k]
         slots[i], mask[i] = rows[i], np.arange(k) < kept.size
         slots[i, : kept.size] = kept
     return slots, mask
@@ -93,15 +89,10 @@ def _links(points, normals, tree, members, min_cosine: float) -> csr_array:
     both = normals[near] + normals[members][:, None]
     along = np.abs(np.einsum("nkd,nkd->nk", d, both)) <= 0.5 * length * np.linalg.norm(both, axis=2)
     place = np.minimum(np.searchsorted(members, near), len(members) - 1)
-    reach = LINK * length[:, [min(_ring_size(points), count) - 1]]
+    reach = LINK * length[:, [min(ring_size(points.shape[1]), count) - 1]]
     step = used & along & (members[place] == near) & (length > 0) & (length <= reach)
     entries = (length[step], (np.nonzero(step)[0], place[step]))
     return csr_array(entries, shape=(len(members), len(members)))
-
-
-def _ring_size(points: np.ndarray) -> int:
-    """A point and its closest neighbours: two of a curve, four of a surface."""
-    return 2 * points.shape[1] - 1
 
 
 def judge(points, normals, row, found, min_cosine: float):

@@ -12,6 +12,7 @@ import numpy as np
 import scipy.sparse
 
 import jaxsurf as js
+from jaxsurf.renew import usual_lists
 
 from ..report import relative_l2
 from .baselines import numpy_gfdm, plain_jax_gfdm
@@ -197,6 +198,8 @@ def moved(name: str, n: int) -> dict:
     """A moved surface in units of building its Laplacian: all of it, areas alone, and gradients.
 
     Gradients in the points, of areas outside `jit`, where they are several programs, and in it.
+    With the neighbours kept, and found anew: these alone, with all decisions (which need the
+    Laplacian) and the normals, and with the areas.
     """
     method, _ = METHODS[name]
     surface = js.discretize(js.sphere(n), method=method)
@@ -206,17 +209,25 @@ def moved(name: str, n: int) -> dict:
     )
     volume = lambda x: jnp.vdot(fresh(x).areas, jnp.sin(x[:, 2]))
 
-    def everything(x):
-        there = surface.moved(x)
-        return there.laplacian.weights, there.areas, there.code
+    everything_of = lambda there: (there.laplacian.weights, there.areas, there.code)
+
+    search = surface.search()
+    lists = surface.neighbors
+
+    def renewed(x):
+        there = surface.moved(x, search=search)
+        return there.laplacian.weights, there.neighbors, there.code
 
     calls = {
         "Laplacian": jax.jit(lambda x: fresh(x).laplacian.weights),
+        "neighbours": jax.jit(lambda x: usual_lists(search, fresh(x).cloud, lists)),
+        "neighbours, normals, adaptation, Laplacian": jax.jit(renewed),
+        "the same and areas": jax.jit(lambda x: everything_of(surface.moved(x, search=search))),
         "areas": lambda x: fresh(x).areas,
         "areas in jit": jax.jit(lambda x: fresh(x).areas),
         "gradient of areas": jax.grad(volume),
         "gradient of areas in jit": jax.jit(jax.grad(volume)),
-        "moved": jax.jit(everything),
+        "moved": jax.jit(lambda x: everything_of(surface.moved(x))),
     }
     found: dict = {}
     for label, call in calls.items():

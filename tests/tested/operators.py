@@ -270,4 +270,14 @@ TESTED = {
         "float32": "test_discretization.py::test_single_precision",
         "bad input": "malformed",
     },
+    "NeighborSearch": {
+        "value": "test_renew.py::test_lists_sizes_and_operators_of_the_host, "
+        "test_renew.py::test_sheets_are_told_apart_as_on_the_host, "
+        "test_renew.py::test_a_moved_cloud_is_as_stable_as_a_new_one",
+        "gradient": {"points": "test_renew.py::test_derivatives_with_lists_that_are_found"},
+        "jit": "test_renew.py::test_lists_sizes_and_operators_of_the_host",
+        "vmap": "test_renew.py::test_mapped",
+        "float32": "test_renew.py::test_single_precision",
+        "bad input": "malformed",
+    },
 }

@@ -1,0 +1,373 @@
+"""Neighbours found anew in compiled code, and adapted: what `choose_neighbors` does, for motion.
+
+All shapes are fixed beforehand, on the host (`NeighborSearch`). Most rows are searched at once,
+within the distance that most need; those that need more, hold points of another sheet or have no
+dominant centre are taken out, some at a time, for as long as there are any.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .adapt import DOMINANCE, dominance, first_slots, is_better, share_wanted, sizes_to_try
+from .arguments import instance, real, whole
+from .build import stencil_weights
+from .cells import distance_key
+from .checks import DETOUR, LINK, RINGS, ring_size
+from .cloud import PointCloud
+from .nearest import Grid, Nearest, nearest_in
+from .neighbors import Neighbors, Rows
+from .sheets import cosine_slack
+from .stencils.method import AbstractMethod
+from .stencils.targets import Laplacian
+
+# Rows that are looked at again are taken out so many at a time, their sheets so many.
+_CHUNK, _SHEETS = 256, 16
+# Points whose neighbours reach farther than others' by so many standard deviations wait for that.
+_DEVIATIONS = 3.0
+# What numbers of candidates are rounded up to.
+_ROUND = 64
+# A list that reaches so many times as far as others' has lost a point.
+_LOST = 4.0
+# How much farther a wider search looks than even points would need.
+_SLACK = 1.1
+# What a code says of a point's list.
+UNREACHED, CROWDED = 4, 5
+
+
+class Tier(NamedTuple):
+    """A search for some rows: how many neighbours, cells to look into, room for candidates."""
+
+    k: int
+    reach: int
+    candidates: int
+
+
+class NeighborSearch(eqx.Module):
+    """Room to find neighbours of a moving surface in, and to adapt them, in compiled code.
+
+    Made by `Discretization.search`, taken by `Discretization.moved`. Its numbers are part of the
+    compiled program: surfaces that share them share it.
+
+    Args:
+        method: how weights are computed; it asks for so many neighbours.
+        k: the usual number of neighbours.
+        sizes: other numbers, tried in turn where the Laplacian has no dominant centre.
+        slots: of the lists; larger neighbourhoods have no room.
+        tiers: the searches for all rows, for those with points out of reach or on another sheet,
+            and for those that are adapted.
+
+    Example:
+        >>> surface = js.discretize(js.sphere(500), method=js.GFDM(degree=2))
+        >>> search = surface.search()
+        >>> isinstance(search, js.NeighborSearch), search.k
+        (True, 36)
+        >>> surface.moved(2 * surface.cloud.points, search=search).neighbors.k == search.slots
+        True
+    """
+
+    method: AbstractMethod
+    k: int = eqx.field(static=True)
+    sizes: tuple[int, ...] = eqx.field(static=True)
+    slots: int = eqx.field(static=True)
+    tiers: tuple[Tier, Tier, Tier] = eqx.field(static=True)
+
+    def __check_init__(self):
+        instance(self.method, AbstractMethod, "method", "GFDM(degree=2), say")
+        if self.slots < self.k:
+            raise ValueError(f"slots = {self.slots}, for k = {self.k} neighbours at least {self.k}")
+        if len(self.tiers) != 3:
+            raise ValueError(f"tiers: {len(self.tiers)} searches, 3 are needed")
+
+    @classmethod
+    def allocated(
+        cls,
+        cloud: PointCloud,
+        neighbors: Neighbors,
+        method: AbstractMethod,
+        margin: float,
+        slots: int | None,
+    ) -> NeighborSearch:
+        """With room for what these points need, times a margin."""
+        real(margin, "margin", least=1)
+        d, available = cloud.dim, int(cloud.host_active.sum())
+        k = min(method.neighbor_count(d), available)
+        slots = max(k, neighbors.k) if slots is None else whole(slots, "slots", least=k)
+        sizes = tuple(sizes_to_try(method, d, k, available))
+        usual = min(max(k, 2 * RINGS), available)
+        grid = _grid(cloud, _reach(cloud, neighbors, k, usual))
+
+        def tier(wanted: int, least: int) -> Tier:
+            wanted = min(wanted, available)
+            reach = max(least, math.ceil(_SLACK * (wanted / usual) ** (1 / (d - 1))))
+            room = min(cloud.n, math.ceil(margin * int(jnp.max(_candidates(grid, reach)))))
+            # Few sizes: surfaces of as many points share a program.
+            return Tier(wanted, reach, -(-room // _ROUND) * _ROUND)
+
+        most = 2 * max(k, *sizes) if sizes else usual
+        first = Tier(usual, 1, tier(0, 1).candidates)
+        return cls(method, k, sizes, slots, (first, tier(max(2 * k, usual), 2), tier(most, 2)))
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _candidates(grid, reach):
+    rows = jnp.arange(len(grid.order), dtype=jnp.int32)
+    return jax.lax.map(lambda i: grid.candidates(i[None], reach, 1)[1][0], rows, batch_size=1024)
+
+
+@eqx.filter_jit
+def renewed(
+    search: NeighborSearch, cloud: PointCloud, before: Neighbors, operators: Callable
+) -> tuple[Neighbors, Int[Array, " n"], tuple]:
+    """Lists of a moved cloud, a code for each, and operators that are built with them.
+
+    Args:
+        before: lists of the same points before they moved. They say how far to look; a row without
+            room for a new list keeps that one.
+        operators: of a cloud, its neighbours and a method, the Laplacian first. They are
+            differentiated; all the rest is constant.
+    """
+    fixed = jax.tree.map(jax.lax.stop_gradient, cloud)
+    usual, code, (grid, rings) = usual_lists(search, fixed, before)
+    built = operators(cloud, usual, search.method)
+    if not search.sizes:
+        return usual, code, built
+    lists = _Lists(usual.indices.T, usual.mask.T, code)
+    lists, changed = _adapted(search, grid, rings, fixed, lists, built[0])
+    adapted = _padded(lists, before, search.slots)
+    again = lambda: operators(cloud, adapted, search.method)
+    return adapted, lists.code, jax.lax.cond(changed, again, lambda: built)
+
+
+def usual_lists(search: NeighborSearch, cloud: PointCloud, before: Neighbors):
+    """Lists of the usual size, a code for each, and what others are found with."""
+    grid = _grid(cloud, _reach(cloud, before, search.k, search.tiers[0].k))
+    found, code = _usual(search, grid)
+    on = True if cloud.active is None else cloud.active
+    code = jnp.where(on & ~grid.on, UNREACHED, code)  # not finite
+    rings = _Rings.of(grid, found)
+    lists = _Lists(found.indices[: search.k], found.mask[: search.k], code)
+    lists = _apart(search, grid, rings, found, lists)
+    return _padded(lists, before, search.slots), lists.code, (grid, rings)
+
+
+class _Lists(eqx.Module):
+    """Lists of some rows, slots first, and what is wrong with them."""
+
+    indices: Int[Array, "k r"]
+    mask: Bool[Array, "k r"]
+    code: Int[Array, " r"]
+
+
+def _reach(cloud, before, k: int, usual: int):
+    """Within which most points find `usual` neighbours, from where their last k are now."""
+    x = cloud.points
+
+    def farthest(most, slot):
+        index, used = slot
+        return jnp.maximum(most, jnp.where(used, jnp.sum((x[index] - x) ** 2, axis=1), 0)), None
+
+    mask = before.mask[:, :k]
+    squared = jax.lax.scan(farthest, jnp.zeros(len(x), x.dtype), (before.indices[:, :k].T, mask.T))
+    count = jnp.sum(mask, axis=1)
+    # Where there are fewer, as many more as a larger disc holds.
+    far = jnp.sqrt(squared[0]) * (usual / jnp.maximum(count, 1)) ** (1 / (cloud.dim - 1))
+    far = far.astype(x.dtype)
+    on = (count > 1) & (far > 0) & jnp.isfinite(far)
+    # A point lost far away is in the lists of many.
+    low = jnp.mean(jnp.where(on, far, 1) ** -2.0, where=on) ** -0.5
+    on = on & (far < _LOST * low)
+    mean = jnp.mean(far, where=on)
+    most = jnp.minimum(
+        jnp.max(far, where=on, initial=0), mean + _DEVIATIONS * jnp.std(far, where=on)
+    )
+    return (1 + 1e-6) * most
+
+
+@jax.jit
+def _grid(cloud, reach):
+    on = jnp.ones(cloud.n, bool) if cloud.active is None else cloud.active
+    return Grid.of(cloud.points, cloud.normals, on, reach)
+
+
+def _usual(search, grid) -> tuple[Nearest, Int[Array, " n"]]:
+    """The nearest of all points, and a code where they were not found."""
+    (k, reach, room), wider, _ = search.tiers
+    n = len(grid.order)
+    rows = jnp.arange(n, dtype=jnp.int32)
+    found = nearest_in(grid, rows, k, reach=reach, count=room)
+    code = jnp.where(found.crowded & grid.on, CROWDED, 0)
+
+    def look(rows, state):
+        again = nearest_in(grid, rows, k, reach=wider.reach, count=wider.candidates, few=True)
+        lost = ~again.mask[search.k - 1] & ~again.all
+        return again, jnp.where(again.crowded, CROWDED, jnp.where(lost, UNREACHED, 0))
+
+    short = grid.on & (code == 0) & ~found.mask[-1]
+    return _for_rows(short, look, (found, code))
+
+
+def _apart(search, grid, rings, found, lists) -> _Lists:
+    """Other sheets taken out."""
+    held = grid.on & (lists.code == 0) & jnp.any(found.above[: search.k], axis=0)
+    look = lambda rows, _: _lists(grid, rings, rows, search.k, search.tiers[1])
+    return _for_rows(held, look, lists)
+
+
+def _adapted(search, grid, rings, cloud, lists, laplacian):
+    """Lists of other sizes where the usual one does not serve, and whether there are any."""
+    share = dominance(*jax.lax.stop_gradient((laplacian.weights, laplacian.diagnostics.residual)))
+    border = jnp.zeros(cloud.n, bool) if cloud.boundary is None else cloud.boundary
+    wanted = share_wanted(border, share)
+    most = max(search.sizes)
+
+    def look(rows, _):
+        wide = _lists(grid, rings, rows, most, search.tiers[2])
+
+        def trial(best_so_far, size):
+            best, chosen = best_so_far
+            some = Rows(wide.indices.T, wide.mask.T & first_slots(size, wide.mask.T))
+            weights, diagnostics = stencil_weights(cloud, some, search.method, Laplacian(), rows)
+            now = dominance(weights, diagnostics.residual)
+            better = is_better(now, best, wanted[rows])
+            return (jnp.where(better, now, best), jnp.where(better, size, chosen)), None
+
+        start = (share[rows], jnp.full(len(rows), search.k))
+        chosen = jax.lax.scan(trial, start, jnp.array(search.sizes))[0][1]
+        chosen = jnp.where(wide.code == 0, chosen, search.k)
+        code = jnp.where(chosen > search.slots, CROWDED, wide.code)
+        held = wide.mask & first_slots(chosen[:, None], wide.mask.T).T
+        indices = _wide(jnp.where(held, wide.indices, rows), search.slots, rows)
+        mask = _wide(held, search.slots, False)
+        changed = (chosen != search.k) & (code == 0)
+        indices = jnp.where(changed, indices, lists.indices[:, rows])
+        return _Lists(indices, jnp.where(changed, mask, lists.mask[:, rows]), code), changed
+
+    poor = grid.on & (lists.code == 0) & (share < DOMINANCE)
+    lists, changed = _for_rows(poor, look, (lists, jnp.zeros(cloud.n, bool)))
+    return lists, jnp.any(changed)
+
+
+def _for_rows(which, look: Callable, state):
+    """Some rows of the arrays of a state, which end with the axis of rows, put in by `look`."""
+    n = len(which)
+    chunk = min(_CHUNK, n)
+    # A chunk may begin at the last of them.
+    rows = jnp.nonzero(which, size=n + chunk, fill_value=n)[0].astype(jnp.int32)
+    count = jnp.sum(which)
+
+    def step(carry):
+        start, state = carry
+        some = jax.lax.dynamic_slice_in_dim(rows, start, chunk)
+        new = look(jnp.minimum(some, n - 1), state)
+        put = lambda old, new: old.at[..., some].set(new.astype(old.dtype), mode="drop")
+        return start + chunk, jax.tree.map(put, state, new)
+
+    start = jnp.zeros((), count.dtype)
+    return jax.lax.while_loop(lambda carry: carry[0] < count, step, (start, state))[1]
+
+
+def _padded(lists: _Lists, before: Neighbors, slots: int) -> Neighbors:
+    """Lists with as many slots; where something is wrong, what there was before."""
+    own = jnp.arange(before.n, dtype=jnp.int32)
+    fitted = lambda indices, mask: (_wide(indices, slots, own).T, _wide(mask, slots, False).T)
+    good = (lists.code == 0)[:, None]
+    new, old = fitted(lists.indices, lists.mask), fitted(before.indices.T, before.mask.T)
+    return Neighbors(*(jnp.where(good, a, b) for a, b in zip(new, old)))
+
+
+def _wide(a, slots: int, value):
+    """As many slots: more are filled with a value."""
+    more = slots - len(a)
+    if more <= 0:
+        return a[:slots]
+    return jnp.concatenate([a, jnp.broadcast_to(value, (more, a.shape[1])).astype(a.dtype)])
+
+
+# --- sheets told apart ---------------------------------------------------------------------
+
+
+class _Rings(eqx.Module):
+    """Which steps over the surface lead away from each point: to so many neighbours, so far.
+
+    Args:
+        length: of the longest step.
+        key: of the distance to the last neighbour that one may lead to.
+        index: its number.
+    """
+
+    length: Float[Array, " n"]
+    key: Int[Array, " n"]
+    index: Int[Array, " n"]
+
+    @classmethod
+    def of(cls, grid: Grid, found: Nearest) -> _Rings:
+        d = len(grid.cells)
+        count = min(len(found.indices), 2 * RINGS)
+        x = jnp.stack(grid.given[:d])
+
+        def squared(slot):
+            return jnp.sum((x[:, found.indices[slot]] - x) ** 2, axis=0)
+
+        key = distance_key(squared(count - 1))
+        key = jnp.where(found.mask[count - 1], key, jnp.iinfo(key.dtype).max)
+        length = LINK * jnp.sqrt(squared(min(ring_size(d), count) - 1))
+        return cls(length, key, found.indices[count - 1])
+
+
+def _lists(grid: Grid, rings: _Rings, rows, k: int, tier: Tier) -> _Lists:
+    """The rows of `find_neighbors(cloud, k)`."""
+    wide = nearest_in(grid, rows, tier.k, reach=tier.reach, count=tier.candidates, few=True)
+    candidates, good = wide.indices[: 2 * k], wide.mask[: 2 * k]
+    usual = (candidates[:k], good[:k])
+    held = jnp.any(wide.above[:k], axis=0)
+
+    def apart():
+        d = len(grid.cells)
+        x, normals = jnp.stack(grid.given[:d], axis=1), jnp.stack(grid.given[d:], axis=1)
+        find = lambda row: _without_islands(x, normals, rings, k, *row)
+        found = jax.lax.map(find, (rows, candidates.T, good.T), batch_size=_SHEETS)
+        return tuple(jnp.where(held, a.T, b) for a, b in zip(found, usual))
+
+    indices, mask = jax.lax.cond(jnp.any(held), apart, lambda: usual)
+    # Where points of another sheet were taken out, others may stand beyond the candidates.
+    lost = ~mask[-1] & ~jnp.where(held, good[-1], False) & ~wide.all
+    code = jnp.where(wide.crowded, CROWDED, jnp.where(lost, UNREACHED, 0))
+    return _Lists(indices, mask, code)
+
+
+def _without_islands(points, normals, rings, k: int, row, found, good):
+    """What a short way over the surface leads to, of the candidates of one row."""
+    x, normal = points[found], normals[found]
+    d = x - x[:, None]
+    squared = jnp.sum(d * d, axis=2)
+    length = jnp.sqrt(squared)
+    both = normal + normal[:, None]
+    # A chord of a smooth curve makes equal angles with the normals at its ends.
+    rise = jnp.abs(jnp.sum(d * both, axis=2))
+    along = rise <= 0.5 * length * jnp.sqrt(jnp.sum(both * both, axis=2))
+    key, last = distance_key(squared), rings.key[found][:, None]
+    among = (key < last) | ((key == last) & (found <= rings.index[found][:, None]))
+    accepted = normal @ normal.T >= -cosine_slack(x.dtype)
+    step = along & among & accepted & (length > 0) & (length <= rings.length[found][:, None])
+    link = jnp.where(step & good & good[:, None], length, jnp.inf)
+    link = jnp.minimum(link, link.T)
+
+    def longer(ways):
+        return ways[1], jnp.minimum(ways[1], jnp.min(ways[1][:, None] + link, axis=0))
+
+    start = jnp.where(jnp.arange(len(found)) == 0, 0, link[0])
+    none = jnp.full_like(start, jnp.nan)
+    way = jax.lax.while_loop(lambda ways: jnp.any(ways[0] != ways[1]), longer, (none, start))[1]
+    kept = good & (way <= DETOUR * jnp.sqrt(jnp.sum((x - points[row]) ** 2, axis=1)))
+    order = jnp.argsort(~kept, stable=True)[:k]
+    mask = kept[order]
+    return jnp.where(mask, found[order], row), mask

@@ -1,0 +1,282 @@
+"""Neighbours of moved points in compiled code: the lists, sizes and operators of the host."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import jaxsurf as js
+from jaxsurf.nearest import Grid, nearest_in
+
+from .helpers import check_derivatives, count_compilations, jittered_sphere, random_sphere
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore:the surface bends", "ignore:no neighbourhood"),
+]
+
+METHOD = js.GFDM(degree=2)
+
+
+def smooth(x, seed, size):
+    """A deformation by a few long waves in random directions."""
+    rng = np.random.default_rng(seed)
+    ways, phases = rng.normal(size=(4, 3)), rng.uniform(0, 2 * np.pi, 4)
+    return x + size * jnp.sin(x @ ways.T + phases) @ jnp.asarray(rng.normal(size=(4, 3)))
+
+
+def twisted(x, rate):
+    a = rate * x[..., 2]
+    turned = [jnp.cos(a) * x[..., 0] - jnp.sin(a) * x[..., 1],
+              jnp.sin(a) * x[..., 0] + jnp.cos(a) * x[..., 1]]  # fmt: skip
+    return jnp.stack([*turned, x[..., 2]], axis=-1)
+
+
+def carried(motion, cloud):
+    """Where a motion takes points and normals."""
+    jacobian = jax.vmap(jax.jacfwd(motion))(cloud.points)
+    normals = jnp.einsum("nji,nj->ni", jnp.linalg.inv(jacobian), cloud.normals)
+    normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+    points = motion(cloud.points)
+    return js.PointCloud(points, normals, boundary=cloud.boundary, active=cloud.active)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def found(surface, cloud, search):
+    moved = surface.moved(cloud.points, cloud.normals, search=search)
+    return moved, moved.laplacian, moved.code
+
+
+def lists(neighbors):
+    """Each as the numbers in it, in their order."""
+    return [
+        row[used].tolist()
+        for row, used in zip(np.asarray(neighbors.indices), np.asarray(neighbors.mask))
+    ]
+
+
+@pytest.fixture(params=["smooth", "twisted", "masked"])
+def moving(request):
+    if request.param == "twisted":
+        return js.torus(600, 1.0, 0.4), [functools.partial(twisted, rate=r) for r in (0.2, 0.5)]
+    cloud = jittered_sphere(600)
+    if request.param == "masked":
+        off = np.random.default_rng(5).permutation(600) < 200
+        points = jnp.where(off[:, None], jnp.nan, cloud.points)
+        cloud = js.PointCloud(points, cloud.normals, active=~off)
+    return cloud, [functools.partial(smooth, seed=s, size=0.1) for s in (0, 1)]
+
+
+def test_lists_sizes_and_operators_of_the_host(moving):
+    cloud, motions = moving
+    surface = js.discretize(cloud, method=METHOD)
+    search = surface.search(margin=3, slots=122)
+    for i, motion in enumerate(motions):
+        there = carried(motion, cloud)
+        if cloud.active is not None:
+            there = js.PointCloud(
+                jnp.where(cloud.active[:, None], there.points, jnp.nan),
+                jnp.where(cloud.active[:, None], there.normals, cloud.normals),
+                active=cloud.active,
+            )
+        with count_compilations() as names:
+            moved, laplacian, code = found(surface, there, search)
+        assert not (i and names), names
+        anew = js.choose_neighbors(there, method=METHOD)
+        assert lists(moved.neighbors) == lists(anew)
+        assert not code.any()
+        expected = js.laplace_beltrami(there, anew, method=METHOD, throw=False)
+        on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+        wanted, width = np.asarray(expected.weights)[:, on], anew.k
+        given = np.asarray(laplacian.weights)[:, on]
+        np.testing.assert_allclose(given[:width], wanted, atol=1e-11 * np.abs(wanted).max())
+        assert not given[width:].any()
+
+
+def toes(m=10, gap=2.4, thick=1.6):
+    """Two slabs side by side on a lattice: right sides of both face the same way."""
+    a = np.stack(np.meshgrid(np.arange(m), np.arange(m), indexing="ij"), -1).reshape(-1, 2)
+    faces = [0, thick, thick + gap, 2 * thick + gap]
+    x = np.concatenate([np.c_[np.full(m * m, f), a + 0.01 * i] for i, f in enumerate(faces)])
+    normals = np.repeat([-1.0, 1.0, -1.0, 1.0], m * m)[:, None] * [1.0, 0.0, 0.0]
+    return js.PointCloud(0.1 * x, normals), np.repeat(np.arange(4), m * m)
+
+
+def test_sheets_are_told_apart_as_on_the_host():
+    cloud, sheet = toes()
+    surface = js.discretize(cloud, method=METHOD)
+    search = surface.search(margin=2, slots=122)
+    for seed in (0, 1):
+        there = carried(functools.partial(smooth, seed=seed, size=0.02), cloud)
+        moved, _, code = found(surface, there, search)
+        anew = js.choose_neighbors(there, method=METHOD)
+        held = np.asarray(moved.neighbors.mask)
+        assert np.all((sheet[np.asarray(moved.neighbors.indices)] == sheet[:, None]) | ~held)
+        good = np.asarray(code) < 4
+        same = np.array([a == b for a, b in zip(lists(moved.neighbors), lists(anew))])
+        assert same[good].all()
+        assert good.all(), np.flatnonzero(~good)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_nearest_of_curves_and_of_lattices(dtype):
+    """Ties, up to round-off, are broken by the number of the point, in either precision."""
+    cloud, _ = toes(gap=5.0)
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    angle = 2 * np.pi * np.sort(np.random.default_rng(0).uniform(size=300))
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    for points, normals, k, reach in (
+        (cloud.points @ turn, cloud.normals @ turn, 20, 0.5),
+        (circle, circle, 9, 0.4),
+    ):
+        points, normals = jnp.asarray(points, dtype), jnp.asarray(normals, dtype)
+        rows = jnp.arange(len(points), dtype=jnp.int32)
+        host = js.find_neighbors(js.PointCloud(points, normals), k, throw=False)
+
+        @functools.partial(jax.jit, static_argnums=2)
+        def search(points, normals, few, rows=rows, k=k, reach=reach):
+            grid = Grid.of(points, normals, rows >= 0, jnp.asarray(reach, points.dtype))
+            return nearest_in(grid, rows, k, reach=1, count=400, few=few)
+
+        for few in (False, True):
+            result = search(points, normals, few)
+            assert not result.crowded.any() and result.mask.all()
+            np.testing.assert_array_equal(result.indices.T, host.indices)
+
+
+def test_what_has_no_room_or_is_out_of_reach_has_a_code():
+    cloud = jittered_sphere(600)
+    surface = js.discretize(cloud, method=METHOD)
+    normals, search = cloud.normals, surface.search(margin=1.2, slots=40)
+    call = jax.jit(lambda x, n: surface.moved(x, n, search=search))
+    code = jax.jit(lambda s: s.code)
+    still = call(cloud.points, normals)
+    assert not code(still).any()
+    # Ten times as many points within a cell, on a part of the surface.
+    near = (cloud.points[:, 2] > 0.5)[:, None]
+    top = jnp.array([0.0, 0.0, 1.0])
+    crowd = js.PointCloud(jnp.where(near, top + 0.2 * (cloud.points - top), cloud.points), normals)
+    crowded = call(crowd.points, normals)
+    assert (code(crowded) == 5).any()
+    kept = np.asarray(code(crowded)) == 5
+    usual = np.asarray(still.neighbors.indices)
+    np.testing.assert_array_equal(np.asarray(crowded.neighbors.indices)[kept][:, :36],
+                                  np.asarray(surface.neighbors.indices)[kept])  # fmt: skip
+    assert usual.shape == crowded.neighbors.indices.shape
+    with pytest.raises(ValueError, match=r"point \d+: more neighbours than there is room for"):
+        crowded.check()
+    # One point alone, far from all others.
+    lost = code(call(cloud.points.at[7].set(jnp.array([9.0, 0, 0])), normals))
+    assert lost[7] == 4 and (np.asarray(lost) > 0).sum() < 60
+    folded = cloud.points * jnp.where(cloud.points[:, :1] > 0, 1, -1) * jnp.array([1.0, 0.2, 1.0])
+    turned = jnp.where(cloud.points[:, :1] > 0, 1, -1) * normals
+    assert (code(call(folded, turned)) == 2).any()
+    assert code(call(cloud.points.at[3].set(jnp.nan), normals))[3] == 1
+    # Adapted neighbourhoods that the lists are too short for.
+    rough = random_sphere(600)
+    narrow = js.discretize(rough, js.find_neighbors(rough, 36), method=METHOD)
+    tight, wide = (narrow.search(margin=2, slots=s) for s in (36, 122))
+    assert (found(narrow, rough, tight)[2] == 5).any()
+    assert not found(narrow, rough, wide)[2].any()
+
+
+def test_kept_lists_reach_as_long_as_the_surface_is_not_stretched_one_way():
+    cloud = js.sphere(600)
+    surface = js.discretize(cloud, method=METHOD)
+    code = jax.jit(lambda x, n: surface.moved(x, n).code)
+
+    def stretched(factor):
+        return carried(lambda x: x * jnp.array([1.0, 1.0, factor]), cloud)
+
+    for there in (stretched(1.6), js.PointCloud(7 * cloud.points, cloud.normals)):
+        assert not code(there.points, there.normals).any()
+    # Along the equator, points come nearer across the stretched direction.
+    there = stretched(4.0)
+    equator = jnp.abs(cloud.points[:, 2]) < 0.3
+    assert (code(there.points, there.normals) == 4)[equator].all()
+    with pytest.raises(ValueError, match=r"point \d+: its list of neighbours no longer reaches"):
+        surface.moved(there.points, there.normals)
+    # In steps, each of which is short: what counts is where the lists were found.
+    step = surface
+    for factor in (1.6, 2.5):
+        there = stretched(factor)
+        step = eqx.filter_jit(lambda s, c: s.moved(c.points, c.normals))(step, there)
+    assert (step.code == 4).any()
+    # A search finds what is nearer now.
+    search = step.search(margin=6, slots=60)
+    moved, _, now = found(step, there, search)
+    assert not now.any()
+    assert lists(moved.neighbors) == lists(js.choose_neighbors(there, method=METHOD))
+
+
+def test_mapped():
+    """Also rows that are treated in loops: those of random points are adapted."""
+    cloud = random_sphere(600)
+    surface = js.discretize(cloud, js.find_neighbors(cloud, 36), method=METHOD)
+    search = surface.search(margin=2, slots=122)
+
+    def lists_of(there):
+        moved = surface.moved(there.points, there.normals, search=search)
+        return moved.neighbors, moved.code
+
+    several = [carried(functools.partial(smooth, seed=2, size=s), cloud) for s in (0.0, 0.08)]
+    together, codes = jax.jit(jax.vmap(lists_of))(jax.tree.map(lambda *a: jnp.stack(a), *several))
+    assert not codes.any()
+    for i, there in enumerate(several):
+        one = jax.tree.map(lambda a, i=i: a[i], together)
+        assert lists(one) == lists(js.choose_neighbors(there, method=METHOD))
+
+
+@pytest.mark.parametrize("make", [jittered_sphere, random_sphere])
+def test_derivatives_with_lists_that_are_found(make):
+    """In points and normals; of random points some lists are adapted."""
+    cloud = make(600)
+    surface = js.discretize(cloud, js.find_neighbors(cloud, 36), method=METHOD)
+    search = surface.search(margin=2, slots=122)
+    u = jnp.sin(cloud.points[:, 0])
+
+    def energy(points, normals):
+        normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+        moved = surface.moved(points, normals, search=search)
+        return jnp.stack([jnp.vdot(u, moved.laplacian(u)), jnp.sum(moved.gradient(u) ** 2)])
+
+    check_derivatives(energy, cloud.points, cloud.normals, step=1e-4)
+
+
+def test_single_precision():
+    double = jittered_sphere(600)
+    cloud = js.PointCloud(*(jnp.asarray(a, jnp.float32) for a in (double.points, double.normals)))
+    surface = js.discretize(cloud, method=METHOD)
+    moved = surface.moved(2 * cloud.points, search=surface.search())
+    assert moved.laplacian.weights.dtype == jnp.float32
+    there = js.PointCloud(2 * cloud.points, cloud.normals)
+    assert lists(moved.neighbors) == lists(js.choose_neighbors(there, method=METHOD))
+
+
+@pytest.mark.parametrize("degree", [2, 4])
+def test_a_moved_cloud_is_as_stable_as_a_new_one(degree):
+    """No growing modes after smooth deformations of the stability study's clouds."""
+    method = js.GFDM(degree=degree)
+    many = random_sphere(4_000)
+    spread = js.poisson_disk(many.points, 0.12, normals=many.normals)
+    disk = js.PointCloud(many.points[spread], many.normals[spread])
+    for start in (jittered_sphere(500), random_sphere(500), disk):
+        surface = js.discretize(start, method=method)
+        search = surface.search(margin=3, slots=3 * surface.neighbors.k)
+        for seed in (0, 1):
+            there = carried(functools.partial(smooth, seed=seed, size=0.1), start)
+            _, laplacian, code = found(surface, there, search)
+            assert not code.any()
+            for operator in (laplacian, js.laplace_beltrami(there, method=method)):
+                values = scipy.linalg.eigvals(operator.to_scipy().toarray())
+                assert values.real.max() < 1e-8 * np.abs(values).max(), (seed, operator)
+
+
+def test_the_search_is_made_on_the_host():
+    surface = js.discretize(js.sphere(300), method=METHOD)
+    with pytest.raises(ValueError, match="search needs a concrete surface"):
+        eqx.filter_jit(lambda s: s.search())(surface)

@@ -220,7 +220,7 @@ def moved(name: str, n: int) -> dict:
 
     calls = {
         "Laplacian": jax.jit(lambda x: fresh(x).laplacian.weights),
-        "neighbours": jax.jit(lambda x: usual_lists(search, fresh(x).cloud, lists)),
+        "neighbours": jax.jit(lambda x: usual_lists(search, fresh(x).cloud, lists)[:2]),
         "neighbours, normals, adaptation, Laplacian": jax.jit(renewed),
         "the same and areas": jax.jit(lambda x: everything_of(surface.moved(x, search=search))),
         "areas": lambda x: fresh(x).areas,

@@ -280,7 +280,7 @@ def test_multigrid_with_levels():
         points = np.full((n, 3), np.nan)
         points[rows] = x
         cloud = js.PointCloud(points, points, active=np.isin(np.arange(n), rows))
-        operator = L(cloud, js.find_neighbors(cloud, 36), method=METHOD).scaled(-1.0).shifted(0.1)
+        operator = 0.1 - L(cloud, js.find_neighbors(cloud, 36), method=METHOD)
         hierarchy = js.multigrid(operator)
         assert len(hierarchy.levels) == 1
         u = np.full(n, np.nan)

@@ -138,7 +138,7 @@ def _distances(points, normals, neighbors, plain, path, known, inverse, smoothin
     laplacian = jnp.where(mixed, _random_walk(points, indices, share), laplacian)
     # The operators on v: similar to those on u, whatever the path.
     growth = jnp.exp((path - path[indices]) / spacing)
-    heat = 1 - spacing**2 * Stencil(indices, laplacian * growth)
+    heat = Stencil(indices, (-(spacing**2) * laplacian * growth).at[0].add(1))
     # Switched-off points have equations of their own, v = 1 and then d = 0.
     start = off.astype(path.dtype).at[sources].set(1)
     v = _warm(heat, start, rtol)

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ..arguments import as_float, instance, is_concrete, whole
+from ..arguments import as_float, instance, is_concrete, switched_off, whole
 from .lineax import Action
 
 
@@ -108,7 +108,8 @@ class AbstractOperator(eqx.Module):
 
     def __add__(self, other) -> AbstractOperator:
         if not isinstance(other, AbstractOperator):
-            other = Diagonal(per_point(other, self.n, "term"), self.n, self.in_shape)
+            term = per_point(other, self.n, "term")
+            other = Diagonal(term, self.n, self.in_shape, active=self.active)
         return Sum(self, other)
 
     def __radd__(self, other) -> AbstractOperator:
@@ -125,7 +126,7 @@ class AbstractOperator(eqx.Module):
 
     def __rmul__(self, factor) -> AbstractOperator:
         factor = per_point(factor, self.n, "factor")
-        return Composition(Diagonal(factor, self.n, self.out_shape), self)
+        return Composition(Diagonal(factor, self.n, self.out_shape, active=self.active), self)
 
     def __mul__(self, factor) -> AbstractOperator:
         if isinstance(factor, AbstractOperator):
@@ -170,6 +171,7 @@ class Diagonal(AbstractOperator):
         factor: a number, or one per point `(n,)`.
         n: number of points; that of the factors if None.
         shape: components per point of the fields, `()` for scalar ones.
+        active: False at points that are switched off, `(n,)`; None if all are on.
 
     Raises:
         TypeError: no real numbers.
@@ -186,14 +188,24 @@ class Diagonal(AbstractOperator):
     factor: Float[Array, "*n"]
     n: int = eqx.field(static=True, default=0)
     in_shape: tuple[int, ...] = eqx.field(static=True, default=())
+    active: Bool[Array, " n"] | None = None
 
-    def __init__(self, factor: ArrayLike, n: int | None = None, shape: tuple[int, ...] = ()):
+    def __init__(
+        self,
+        factor: ArrayLike,
+        n: int | None = None,
+        shape: tuple[int, ...] = (),
+        *,
+        active: Bool[Array, " n"] | None = None,
+    ):
         factor = as_float(factor, "factor")
         if n is None and factor.ndim != 1:
             raise ValueError(f"factor has shape {factor.shape}, expected (n,), or n is needed")
         self.n = whole(len(factor) if n is None else n, "n", least=1)
         self.in_shape = shape
-        self.factor = per_point(factor, self.n, "factor")
+        self.factor, self.active = per_point(factor, self.n, "factor"), active
+        if self.factor.ndim:
+            self.factor = switched_off(active, self.factor)
 
     def __repr__(self):
         return f"Diagonal({self._maps})"
@@ -209,7 +221,7 @@ class Diagonal(AbstractOperator):
         return jnp.broadcast_to(self.factor, self.n)
 
     def __call__(self, u):
-        u = self.checked(u)
+        u = switched_off(self.active, self.checked(u))
         if not self.factor.ndim:  # numbers leave the precision of a field
             return self.factor.astype(u.dtype) * u
         return self.factor.reshape(-1, *[1] * (u.ndim - 1)) * u
@@ -219,6 +231,7 @@ class Diagonal(AbstractOperator):
 
     def to_scipy(self):
         factor = np.broadcast_to(np.asarray(self.factor), self.n)
+        factor = factor if self.active is None else np.where(self.active, factor, 0)
         return scipy.sparse.diags(np.repeat(factor, math.prod(self.in_shape))).tocsr()
 
 

@@ -18,7 +18,7 @@ from .adapt import (
     sizes_to_try,
 )
 from .adapt import residual_tolerance as residual_tolerance
-from .arguments import instance, is_concrete, refuse
+from .arguments import instance, is_concrete, refuse, without_derivatives
 from .arguments import mask as checked_mask
 from .cloud import PointCloud
 from .compiling import copying_jit, namespace, sized_jit
@@ -91,7 +91,7 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     weights = None
     if neighbors is None:
         neighbors, laplacian = _adapted(cloud, method, throw)
-        if isinstance(target, Laplacian):
+        if isinstance(target, Laplacian) and is_concrete(*jax.tree.leaves(cloud)):
             weights = laplacian
     _check_sizes(cloud, neighbors, method, target, throw)
     if weights is None:
@@ -171,8 +171,12 @@ def rows_of(weights, others, count: int):
 
 def _adapted(cloud, method, throw, needed=True):
     """Neighbours that suit the method, and the Laplacian's weights and diagnostics with them."""
+    cloud = without_derivatives(cloud)
     if not is_concrete(*jax.tree.leaves(cloud)):
-        raise ValueError("neighbors=None needs concrete arrays; under jit pass the neighbours")
+        raise ValueError(
+            "neighbors=None needs arrays whose values are known; under jit and vmap pass the "
+            "neighbours"
+        )
     on = cloud.host_active
     available = int(on.sum())
     k = min(method.neighbor_count(cloud.dim), available)

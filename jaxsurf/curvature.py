@@ -31,7 +31,7 @@ def shape_tensor(
 
     Args:
         cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
         method: how derivatives are computed.
 
     Returns:
@@ -75,7 +75,7 @@ def mean_curvature(
 
     Args:
         cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
         method: how derivatives are computed.
 
     Returns:
@@ -110,7 +110,7 @@ def gauss_curvature(
 
     Args:
         cloud: n points in three dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
         method: how derivatives are computed.
 
     Returns:
@@ -145,7 +145,7 @@ def principal_curvatures(
 
     Args:
         cloud: n points in three dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
         method: how derivatives are computed.
 
     Returns:
@@ -192,7 +192,7 @@ def mean_curvature_vector(
 
     Args:
         cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
         method: how derivatives are computed.
 
     Returns:

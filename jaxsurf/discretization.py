@@ -399,7 +399,7 @@ def discretize(
 
     Args:
         cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
         method: how weights are computed.
 
     Returns:

@@ -9,7 +9,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .arguments import as_float, finite, is_array, is_concrete, point_indices, raise_at, real, whole
+from .arguments import (
+    as_float,
+    finite,
+    is_array,
+    is_concrete,
+    point_indices,
+    raise_at,
+    real,
+    whole,
+    without_derivatives,
+)
 from .checks import check_count, check_orientation, check_overlap, check_spacing, two_sheets
 from .cloud import PointCloud
 from .sheets import distance_key, judge, nearest, without_islands
@@ -144,11 +154,12 @@ def find_neighbors(
         Neighbour lists. A row that has fewer than k acceptable points among its 8 k nearest
         is padded, with mask False.
 
-    Differentiable: the lists are integers; operators are differentiable for fixed lists.
+    Differentiable: the lists are integers; operators are differentiable for fixed lists. Under
+    `grad` they are those of the values that are differentiated.
     Raises:
         TypeError: no cloud or array of points; k or capacity that are not whole numbers.
-        ValueError: traced arrays (use `search_neighbors`); k, radius or capacity out of range
-            (both numbers given); duplicates, lone points, mixed orientation and sheets too
+        ValueError: arrays traced by `jit` or `vmap` (use `search_neighbors`); k, radius or
+            capacity out of range (both numbers given); duplicates, lone points, mixed orientation and sheets too
             close to be told apart (named by index).
 
     Example:
@@ -160,9 +171,11 @@ def find_neighbors(
     """
     if (k is None) == (radius is None):
         raise ValueError("give exactly one of k and radius")
+    cloud = without_derivatives(cloud)
     if not is_concrete(*jax.tree.leaves((cloud, radius))):
         raise ValueError(
-            "find_neighbors needs concrete arrays; under jit, vmap or grad use search_neighbors"
+            "find_neighbors needs arrays whose values are known, and a radius that is not "
+            "differentiated; under jit and vmap use search_neighbors"
         )
     if k is not None and capacity is not None:
         raise ValueError("capacity belongs to a search by radius; with k the rows have k slots")

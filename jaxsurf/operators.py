@@ -32,7 +32,7 @@ def laplace_beltrami(
 
     Args:
         cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
         method: how the weights are computed.
         throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`. Under `jit`,
             `vmap` and `grad` nothing is raised: the diagnostics are the result code.
@@ -75,7 +75,7 @@ def surface_gradient(
 
     Args:
         cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
         method: how the weights are computed.
         throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
 
@@ -112,7 +112,7 @@ def surface_divergence(
 
     Args:
         cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
         method: how the weights are computed.
         throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
 
@@ -151,7 +151,7 @@ def directional_derivative(
     Args:
         cloud: n points in d dimensions with unit normals.
         direction: a, `(n, d)` or `(d,)`; its length scales the derivative.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
         method: how the weights are computed.
         throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
 
@@ -205,7 +205,7 @@ def diffusion(
         cloud: n points in d dimensions with unit normals.
         diffusivity: D, scalar `(n,)` or symmetric tensor `(n, d, d)`, neither negative; of a
             tensor only the tangential part counts. Taken in the precision of the cloud.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
         method: how the weights are computed.
         throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
 
@@ -296,7 +296,7 @@ def biharmonic(
 
     Args:
         cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (host only).
+        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
         method: how the weights are computed.
         throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
 

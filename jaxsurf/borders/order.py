@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
-from ..arguments import instance, is_concrete
+from ..arguments import instance, is_concrete, without_derivatives
 from ..cloud import PointCloud
 from ..shapes.meshes import TriangleMesh
 from ..sheets import distance_key
@@ -80,6 +80,7 @@ def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
         (20, 4)
     """
     instance(cloud, PointCloud, "cloud")
+    cloud = without_derivatives(cloud)
     if not is_concrete(cloud.points, cloud.normals, cloud.boundary):
         raise ValueError("find_border needs a concrete cloud; find it first and pass it on")
     if mesh is not None:

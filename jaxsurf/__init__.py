@@ -82,6 +82,7 @@ from .stencils.dcpse import FlatDCPSE as FlatDCPSE
 from .stencils.gfdm import GFDM as GFDM
 from .stencils.method import AbstractMethod as AbstractMethod
 from .stencils.method import Diagnostics as Diagnostics
+from .stencils.rbffd import RBFFD as RBFFD
 from .stencils.stencil import AbstractOperator as AbstractOperator
 from .stencils.stencil import Composition as Composition
 from .stencils.stencil import Stencil as Stencil

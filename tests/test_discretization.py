@@ -44,6 +44,7 @@ def errors(method, n):
         (js.GFDM(degree=2), (2e-5, 5e-5, 4e-3, 1.5e-2, 2e-2)),
         (js.GFDM(degree=4), (2e-6, 4e-6, 6e-5, 4e-4, 4e-4)),
         (js.DCPSE(order=4), (2e-6, 4e-6, 6e-5, 4e-4, 4e-4)),
+        (js.RBFFD(degree=4), (2e-6, 4e-6, 6e-5, 4e-4, 4e-4)),
     ],
     ids=str,
 )

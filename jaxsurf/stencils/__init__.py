@@ -1,1 +1,1 @@
-"""Stencils: kernels, monomials, the batched moment solves, and the two methods built on them."""
+"""Stencils: kernels, monomials, the batched moment solves, and the methods built on them."""

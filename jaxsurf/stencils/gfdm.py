@@ -10,8 +10,7 @@ import jax.numpy as jnp
 
 from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive, with_center
 from .moments import moment_solve
-from .monomials import polynomial_count
-from .plane import TangentPlane
+from .plane import TangentPlane, needed_polynomials
 from .targets import AbstractTarget
 
 
@@ -54,13 +53,7 @@ class GFDM(AbstractMethod):
         return _SURFACE_COUNT[min(self.degree, 6)] if dim == 3 else 5 + 2 * self.degree
 
     def basis_size(self, dim, target):
-        if self.degree < target.order:
-            raise ValueError(
-                f"degree = {self.degree}: polynomials of degree at least {target.order} are needed "
-                f"for derivatives of order {target.order}, and so for the Laplacian by which "
-                "neighbours are chosen"
-            )
-        return polynomial_count(dim - 1, self.degree)
+        return needed_polynomials(self.degree, dim, target)
 
     @property
     def batch_size(self):

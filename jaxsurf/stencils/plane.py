@@ -10,6 +10,8 @@ from ..frames import tangent_frames
 from .kernels import gaussian
 from .method import Neighborhood, dot
 from .moments import polynomial_fit
+from .monomials import polynomial_count
+from .targets import AbstractTarget
 
 
 class TangentPlane(eqx.Module):
@@ -47,6 +49,21 @@ class TangentPlane(eqx.Module):
     def surface(self, degree: int) -> Float[Array, "m *p"]:
         """Coefficients of the surface as a graph over the plane, of degrees 1 to `degree`."""
         return polynomial_fit(self.points, self.weights, self.heights[None], 1, degree)[:, 0]
+
+
+def needed_polynomials(degree: int, dim: int, target: AbstractTarget) -> int:
+    """Polynomials of a degree over the tangents, for methods that are exact on all of these.
+
+    Raises:
+        ValueError: a degree below the order of the derivatives.
+    """
+    if degree < target.order:
+        raise ValueError(
+            f"degree = {degree}: polynomials of degree at least {target.order} are needed "
+            f"for derivatives of order {target.order}, and so for the Laplacian by which "
+            "neighbours are chosen"
+        )
+    return polynomial_count(dim - 1, degree)
 
 
 def _width(degree: int) -> float:

@@ -20,8 +20,6 @@ from .stencils.moments import blockwise, in_blocks, out_of_blocks
 from .stencils.stencil import Stencil
 from .stencils.targets import Laplacian
 
-# A stencil is adapted if the weight of its centre is less than this share of all the others.
-_DOMINANCE = 0.2
 # Sizes of the neighbourhoods of such points, in units of the usual one: tried in turn.
 _SIZES = (1.5, 2.25, 3.4, 0.67, 0.45)
 # Stencils that are tried at a time: few shapes are ever compiled.
@@ -39,12 +37,12 @@ def choose_neighbors(
 
     Every point gets the number of neighbours that the method asks for. Where the
     Laplacian's weight of the centre is then positive or small,
-    $-w_{ii} < 0.2 \sum_{j \ne i} |w_{ij}|$, or its conditions cannot be met, larger
-    neighbourhoods are tried, by half, up to three times, then smaller ones, which see less of a
-    fold. The first that serves is taken; if none does, that with the most dominant centre, on a
-    border the usual one: a one-sided Laplacian has no dominant centre, however large. Such
-    points are what gives collocation matrices eigenvalues with positive real part
-    (`experiments`, stability study).
+    $-w_{ii} < 0.2 \sum_{j \ne i} |w_{ij}|$ (with RBF-FD only where it is positive), or its
+    conditions cannot be met, larger neighbourhoods are tried, by half, up to three times, then
+    smaller ones, which see less of a fold. The first that serves is taken; if none does, that with
+    the most dominant centre, on a border the usual one: a one-sided Laplacian has no dominant
+    centre, however large. Such points are what gives collocation matrices eigenvalues with
+    positive real part (`experiments`, stability study).
 
     Args:
         cloud: n points in d dimensions with unit normals; concrete.
@@ -172,8 +170,8 @@ def _adapted(cloud, method, throw, needed=True):
     neighbors = find_neighbors(cloud, k, throw=throw)
     _check_sizes(cloud, neighbors, method, Laplacian(), throw)
     found = stencil_weights(cloud, neighbors, method, Laplacian())
-    dominance = _dominance(*found)
-    poor = np.flatnonzero(on & needed & (dominance < _DOMINANCE))
+    dominance, least = _dominance(*found), method.least_dominance
+    poor = np.flatnonzero(on & needed & (dominance < least))
     need = method.basis_size(cloud.dim, Laplacian())
     sizes = [min(int(k * size), available) for size in _SIZES if k * size > 1.5 * need]
     border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
@@ -186,11 +184,11 @@ def _adapted(cloud, method, throw, needed=True):
     indices, mask = nearest_of(cloud, rows, max(sizes))
     chosen, best = np.full(rows.size, k), dominance[rows]
     kept = [_wider(np.asarray(a)[..., rows], max(sizes)) for a in jax.tree.leaves(found)]
-    wanted = np.where(border & (dominance > -np.inf), _DOMINANCE, -np.inf)[rows]
+    wanted = np.where(border & (dominance > -np.inf), least, -np.inf)[rows]
     for size in sizes:
         trial = _in_chunks(cloud, indices, mask & _first(size, mask), method, rows)
         now = _dominance(*trial)
-        better = (best < _DOMINANCE) & (now > best) & (now >= wanted)
+        better = (best < least) & (now > best) & (now >= wanted)
         best = np.where(better, now, best)
         chosen = np.where(better, size, chosen)
         kept = [np.where(better, new, old) for new, old in zip(jax.tree.leaves(trial), kept)]
@@ -233,13 +231,13 @@ def _in_chunks(cloud, indices, mask, method, rows):
 
 def _report(poor, best, border, chosen, method) -> None:
     """Warn of points inside the surface where no size serves."""
-    failed = (best < _DOMINANCE) & ~border[poor]
+    failed = (best < method.least_dominance) & ~border[poor]
     if failed.any():
         worst = np.flatnonzero(failed)[np.argmin(best[failed])]
         warnings.warn(
             f"no neighbourhood of {failed.sum()} points serves {method}: the worst is point "
             f"{poor[worst]}, where the centre has a share of {best[worst]:.2g} of the weights of "
-            f"{chosen[worst]} neighbours, {_DOMINANCE} is needed; the operator may have growing "
+            f"{chosen[worst]} neighbours, {method.least_dominance} is needed; the operator may have growing "
             "modes (js.spectral_estimate)",
             stacklevel=4,
         )

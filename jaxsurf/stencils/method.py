@@ -116,6 +116,11 @@ class AbstractMethod(eqx.Module):
         return False
 
     @property
+    def least_dominance(self) -> float:
+        """Share of the centre among the Laplacian's weights below which a point is adapted."""
+        return 0.2
+
+    @property
     @abc.abstractmethod
     def batch_size(self) -> int:
         """How many stencils are computed at once: enough to be fast, few enough for the cache."""

@@ -237,8 +237,8 @@ def _report(poor, best, border, chosen, method) -> None:
         warnings.warn(
             f"no neighbourhood of {failed.sum()} points serves {method}: the worst is point "
             f"{poor[worst]}, where the centre has a share of {best[worst]:.2g} of the weights of "
-            f"{chosen[worst]} neighbours, {method.least_dominance} is needed; the operator may have growing "
-            "modes (js.spectral_estimate)",
+            f"{chosen[worst]} neighbours, {method.least_dominance} is needed; the operator "
+            "may have growing modes (js.spectral_estimate)",
             stacklevel=4,
         )
 

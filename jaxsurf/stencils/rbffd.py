@@ -2,6 +2,7 @@ r"""RBF-FD: polyharmonic splines with polynomials (Flyer et al., J. Comput. Phys
 
 from __future__ import annotations
 
+import functools
 import itertools
 
 import equinox as eqx
@@ -110,17 +111,29 @@ def _power(r2, exponent):
     return jnp.where(r2 > 0, jnp.sqrt(jnp.where(r2 > 0, r2, 1)) ** exponent, 0)
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def _solve(a, b, k):
-    """Solution, differentiated by solves with the same factors, and a condition estimate."""
-    fixed = jax.lax.stop_gradient(a)
-    # Shift and refinement as in `systems.factor`: dependent polynomials show in the residual.
-    shift = jnp.where(jnp.arange(a.shape[-1]) < k, 0, 4 * a.shape[-1] * jnp.finfo(a.dtype).eps)
-    factors = jax.scipy.linalg.lu_factor(fixed - jnp.diag(shift))
+    """Solution s, with the derivative $A^{-1}(db - dA s)$, and a condition estimate."""
+    solve, condition = _factor(a, k)
+    return solve(b), condition
 
-    def solve(_, b):
+
+@_solve.defjvp
+def _solve_jvp(k, primals, tangents):
+    solve, condition = _factor(primals[0], k)
+    solution = solve(primals[1])
+    moved = solve(tangents[1] - tangents[0] @ solution)
+    return (solution, condition), (moved, jnp.zeros_like(condition))
+
+
+def _factor(a, k):
+    """As `systems.factor`: a shift of the size of round-off, which a refinement takes away."""
+    shift = jnp.where(jnp.arange(a.shape[-1]) < k, 0, 4 * a.shape[-1] * jnp.finfo(a.dtype).eps)
+    factors = jax.scipy.linalg.lu_factor(a - jnp.diag(shift))
+
+    def solve(b):
         first = jax.scipy.linalg.lu_solve(factors, b)
-        return first + jax.scipy.linalg.lu_solve(factors, b - fixed @ first)
+        return first + jax.scipy.linalg.lu_solve(factors, b - a @ first)
 
     pivot = jnp.abs(jnp.diagonal(factors[0], axis1=-2, axis2=-1))
-    condition = jnp.max(pivot, axis=-1) / jnp.min(pivot, axis=-1)
-    return jax.lax.custom_linear_solve(lambda s: a @ s, b, solve, symmetric=True), condition
+    return solve, jnp.max(pivot, axis=-1) / jnp.min(pivot, axis=-1)

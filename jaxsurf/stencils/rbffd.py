@@ -2,7 +2,6 @@ r"""RBF-FD: polyharmonic splines with polynomials (Flyer et al., J. Comput. Phys
 
 from __future__ import annotations
 
-import functools
 import itertools
 
 import equinox as eqx
@@ -20,11 +19,9 @@ from .targets import AbstractTarget
 class RBFFD(AbstractMethod):
     r"""Tangent-plane RBF-FD with polyharmonic splines and polynomials of a given degree.
 
-    Fields are interpolated by $\sum_j a_j |x - x_j|^m$ plus a polynomial of degree p, and the
-    interpolant is differentiated: with $\Phi_{ij} = |x_i - x_j|^m$ and the monomials P the weights
-    w of an operator L solve $\Phi w + P \lambda = L\phi$, $P^T w = L P$. Polynomials give the
-    order, splines stability where points are uneven. These have no length, and so no width and no
-    cut-off: weights are smooth for fixed neighbours, and jump where a list of them changes.
+    With $\Phi_{ij} = |x_i - x_j|^m$ and the monomials P, the weights w of an operator L solve
+    $\Phi w + P \lambda = L\phi$, $P^T w = L P$. Splines, which need no width and no support, make
+    uneven points stable; weights are smooth for fixed neighbours, and jump where these change.
 
     Args:
         degree: polynomial degree p; gradients then converge like $h^p$ and the Laplacian like
@@ -47,8 +44,8 @@ class RBFFD(AbstractMethod):
 
     def __check_init__(self):
         check_positive(self, degree=True)
-        whole(self.exponent, "RBFFD: exponent", least=3, most=2 * self.degree + 1)
-        if self.exponent % 2 == 0:
+        most = 2 * self.degree + 1
+        if whole(self.exponent, "RBFFD: exponent", least=3, most=most) % 2 == 0:
             raise ValueError(f"RBFFD: exponent = {self.exponent}, expected an odd number")
 
     def neighbor_count(self, dim):
@@ -63,30 +60,26 @@ class RBFFD(AbstractMethod):
     least_dominance = property(lambda self: 0.0)  # as stable as with more, `experiments.stability`
 
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
-        # LAPACK wants matrices last: the points of the block come first.
-        offsets = jnp.moveaxis(neighborhood.offsets, (0, 1), (-2, -1))
-        tangents = tangent_frames(neighborhood.normals[0].T)[..., :-1, :]
+        tangents = tangent_frames(neighborhood.normals[0].T)[..., :-1, :]  # points first: LAPACK
         k, on = len(neighborhood.mask), jnp.moveaxis(neighborhood.mask, 0, -1)
         # The farthest. The weights do not depend on the unit: it may be taken as constant.
         unit = jnp.max(jnp.where(neighborhood.mask, neighborhood.squared, 0), axis=0)
         unit = jax.lax.stop_gradient(jnp.sqrt(jnp.where(unit > 0, unit, 1)))
-        x = jnp.einsum("...kd,...td->t...k", offsets, tangents) / unit[..., None]
+        x = jnp.einsum("kd...,...td->t...k", neighborhood.offsets, tangents) / unit[..., None]
         a, b = _matrix(x, on, self), _right_hand_side(x, on, self, target)
         solution, condition = _solve(a, b, k)
-        error = jnp.max(jnp.abs(a @ solution - b)[..., k:, :], axis=(-2, -1))
-        residual = error / jnp.max(jnp.abs(b[..., k:, :]), axis=(-2, -1))
+        error, size = (jnp.max(jnp.abs(v[..., k:, :]), (-2, -1)) for v in (a @ solution - b, b))
         eta = jnp.moveaxis(solution[..., :k, :], (-1, -2), (0, 1))
         eta = with_center(target.in_units(eta, unit, len(x)))
         reach = unit * (1 + 4 * jnp.finfo(unit.dtype).eps)  # of a support that holds the farthest
-        diagnostics = Diagnostics.of(neighborhood, condition, residual, reach, 0)
+        diagnostics = Diagnostics.of(neighborhood, condition, error / size, reach, 0)
         return target.assemble(eta, jnp.moveaxis(tangents, (-2, -1), (0, 1))), diagnostics
 
 
 def _matrix(x, on, method):
     """Of coordinates `(t, *p, k)`; slots that are off have rows of the identity."""
     phi = _power(sum((c[..., None] - c[..., None, :]) ** 2 for c in x), method.exponent)
-    identity = jnp.eye(x.shape[-1], dtype=x.dtype) * ~on[..., None]
-    phi = jnp.where(on[..., None] & on[..., None, :], phi, identity)
+    phi = jnp.where(on[..., None] & on[..., None, :], phi, jnp.eye(x.shape[-1], dtype=x.dtype))
     p = jnp.where(on, monomials(x, method.degree), 0)
     zero = jnp.zeros((*on.shape[:-1], len(p), len(p)), x.dtype)
     return jnp.block([[phi, jnp.moveaxis(p, 0, -1)], [jnp.moveaxis(p, 0, -2), zero]])
@@ -98,8 +91,7 @@ def _right_hand_side(x, on, method, target):
     value, first, second = (_power(square, m - less) for less in (0, 2, 4))
     taylor = [value, *(-m * first * c for c in x)]
     for a, b in itertools.combinations_with_replacement(x, 2):
-        mixed = m * (m - 2) * second * a * b
-        taylor.append((mixed + m * first) / 2 if a is b else mixed)
+        taylor.append(m * ((m - 2) * second * a * b + (a is b) * first) / (1 + (a is b)))
     splines, wanted = (target.moments(len(x), 0, d).astype(x.dtype) for d in (2, method.degree))
     splines = jnp.where(on[..., None], jnp.tensordot(jnp.stack(taylor), splines, (0, 0)), 0)
     wanted = jnp.broadcast_to(wanted, (*on.shape[:-1], *wanted.shape))
@@ -107,33 +99,22 @@ def _right_hand_side(x, on, method, target):
 
 
 def _power(r2, exponent):
-    """A power of the distance: 0, with derivative 0, at 0."""
-    return jnp.where(r2 > 0, jnp.sqrt(jnp.where(r2 > 0, r2, 1)) ** exponent, 0)
+    """A power of the distance, constant below round-off (a guard r2 > 0 has failed: fused into
+    several loops, r2 is 0 in one and, with fused multiply-adds, not in another)."""
+    return jnp.sqrt(jnp.maximum(r2, jnp.finfo(r2.dtype).eps ** 2)) ** exponent
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def _solve(a, b, k):
-    """Solution s, with the derivative $A^{-1}(db - dA s)$, and a condition estimate."""
-    solve, condition = _factor(a, k)
-    return solve(b), condition
-
-
-@_solve.defjvp
-def _solve_jvp(k, primals, tangents):
-    solve, condition = _factor(primals[0], k)
-    solution = solve(primals[1])
-    moved = solve(tangents[1] - tangents[0] @ solution)
-    return (solution, condition), (moved, jnp.zeros_like(condition))
-
-
-def _factor(a, k):
-    """As `systems.factor`: a shift of the size of round-off, which a refinement takes away."""
+    """Solution, differentiated by solves with the same factors, and a condition estimate."""
+    fixed = jax.lax.stop_gradient(a)
+    # Shift and refinement as in `systems.factor`: dependent polynomials show in the residual.
     shift = jnp.where(jnp.arange(a.shape[-1]) < k, 0, 4 * a.shape[-1] * jnp.finfo(a.dtype).eps)
-    factors = jax.scipy.linalg.lu_factor(a - jnp.diag(shift))
+    factors = jax.scipy.linalg.lu_factor(fixed - jnp.diag(shift))
 
-    def solve(b):
+    def solve(_, b):
         first = jax.scipy.linalg.lu_solve(factors, b)
-        return first + jax.scipy.linalg.lu_solve(factors, b - a @ first)
+        return first + jax.scipy.linalg.lu_solve(factors, b - fixed @ first)
 
+    solution = jax.lax.custom_linear_solve(lambda s: a @ s, b, solve, symmetric=True)
     pivot = jnp.abs(jnp.diagonal(factors[0], axis1=-2, axis2=-1))
-    return solve, jnp.max(pivot, axis=-1) / jnp.min(pivot, axis=-1)
+    return solution, jnp.max(pivot, axis=-1) / jnp.min(pivot, axis=-1)

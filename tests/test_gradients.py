@@ -164,6 +164,22 @@ def test_padded_and_switched_off_rows_have_finite_gradients():
         assert jnp.abs(gradient[~keep]).max() == 0 < jnp.abs(gradient[keep]).max()
 
 
+def test_compiled_tangents_of_splines():
+    """In one program with the derivative, distances are computed more than once: see `_power`."""
+    method = js.RBFFD(degree=2)
+    neighbors = js.find_neighbors(CLOUD, k=14)
+    points = CLOUD.points * jnp.array([1.0, 1.2, 1.5])
+
+    def weights(points):
+        return js.laplace_beltrami(cloud_of(points), neighbors, method=method).weights
+
+    direction = jnp.sin(jnp.arange(points.size, dtype=points.dtype)).reshape(points.shape)
+    values, tangents = jax.jit(lambda p: jax.jvp(weights, (p,), (direction,)))(points)
+    expected = weights(points), jax.jvp(weights, (points,), (direction,))[1]
+    for found, plain in zip((values, tangents), expected):
+        np.testing.assert_allclose(found, plain, atol=1e-9 * jnp.abs(plain).max())
+
+
 def test_gradient_under_vmap():
     neighbors = js.choose_neighbors(CLOUD)
 

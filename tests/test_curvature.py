@@ -34,7 +34,9 @@ def test_torus(method):
     around /= jnp.linalg.norm(around, axis=1, keepdims=True)
     assert jnp.abs(jnp.abs(jnp.sum(around * directions[:, 0], axis=1)) - 1).max() < 10 * bound
     vector = js.mean_curvature_vector(cloud, **args)
-    assert relative_error(vector, -2 * mean[:, None] * cloud.normals) < 3 * bound
+    # Twice the mean curvature by the Laplacian, which of RBF-FD is less accurate than the gradient.
+    times = 10 if isinstance(method, js.RBFFD) else 3
+    assert relative_error(vector, -2 * mean[:, None] * cloud.normals) < times * bound
     tensor = js.shape_tensor(cloud, **args)
     np.testing.assert_allclose(jnp.einsum("nab,nb->na", tensor, cloud.normals), 0, atol=1e-12)
 

@@ -336,7 +336,7 @@ ONE_SIDED = [
     (js.DCPSE(order=2), js.GFDM(degree=3), "neumann", 8e-4, 1.7),
     (js.DCPSE(order=4), js.GFDM(degree=4), "neumann", 1.7e-5, 3.8),
     (js.DCPSE(order=4), js.DCPSE(order=4), "neumann", 6e-4, 3.8),
-    (js.RBFFD(degree=4), js.RBFFD(degree=4), "neumann", 2e-5, 3.8),
+    (js.RBFFD(degree=4), js.RBFFD(degree=4), "neumann", 2e-5, 3.7),
 ]
 
 

@@ -25,7 +25,11 @@ _PEERS = {
     js.DCPSE(order=2): ("OpenFPM order 2, k = 26", {"regular": 2.9e-4, "jittered": 2.9e-4}),
     js.DCPSE(order=4): ("OpenFPM order 4, k = 47", {"regular": 6.4e-7, "jittered": 6.1e-7}),
 }
-_METHODS = [js.DCPSE(order=r) for r in (2, 3, 4)] + [js.GFDM(degree=p) for p in (2, 3, 4, 5)]
+_METHODS: list[Method] = [
+    *(js.DCPSE(order=r) for r in (2, 3, 4)),
+    *(js.GFDM(degree=p) for p in (2, 3, 4, 5)),
+    *(js.RBFFD(degree=p) for p in (2, 4)),
+]
 
 
 def polynomial_degree(method: Method) -> int:

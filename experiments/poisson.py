@@ -18,6 +18,7 @@ _METHODS: dict[Method, int] = {
     js.DCPSE(order=4): 4,
     js.GFDM(degree=3): 2,
     js.GFDM(degree=5): 4,
+    js.RBFFD(degree=5): 4,
 }
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 import jaxsurf as js
 
-Method = js.DCPSE | js.GFDM
+Method = js.DCPSE | js.GFDM | js.RBFFD
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,9 @@ def relative_l2(found, exact) -> float:
 
 def method_name(method: Method) -> str:
     """As it is written in code: `DCPSE(order=4)`."""
-    if isinstance(method, js.GFDM):
-        return f"GFDM(degree={method.degree})"
-    return f"DCPSE(order={method.order})"
+    if isinstance(method, js.DCPSE):
+        return f"DCPSE(order={method.order})"
+    return f"{type(method).__name__}(degree={method.degree})"
 
 
 def write_json(path: Path, name: str, rows: list[Row], seconds: float) -> None:

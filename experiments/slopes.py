@@ -18,7 +18,7 @@ _KINDS = ("regular", "jittered", "Poisson disk")
 _QUICK = {"sphere": "regular", "ellipsoid": "jittered", "torus": "regular"}
 # The order of convergence that each method promises.
 _METHODS: dict[Method, int] = {js.DCPSE(order=r): r for r in (2, 3, 4)} | {
-    js.GFDM(degree=r + 1): r for r in (2, 3, 4)
+    make(degree=r + 1): r for make in (js.GFDM, js.RBFFD) for r in (2, 3, 4)
 }
 
 

@@ -21,10 +21,12 @@ _METHODS: list[Method] = [
     js.DCPSE(order=4),
     js.GFDM(degree=2),
     js.GFDM(degree=4),
+    js.RBFFD(degree=2),
+    js.RBFFD(degree=4),
 ]
 
 
-_QUICK: list[Method] = [js.DCPSE(order=2), js.GFDM(degree=4)]
+_QUICK: list[Method] = [js.DCPSE(order=2), js.GFDM(degree=4), js.RBFFD(degree=4)]
 
 
 def clouds(n: int) -> Iterator[tuple[str, js.PointCloud]]:

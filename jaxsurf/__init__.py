@@ -88,6 +88,7 @@ from .stencils.dcpse import FlatDCPSE as FlatDCPSE
 from .stencils.gfdm import GFDM as GFDM
 from .stencils.method import AbstractMethod as AbstractMethod
 from .stencils.method import Diagnostics as Diagnostics
+from .stencils.rbffd import RBFFD as RBFFD
 from .stencils.stencil import Stencil as Stencil
 from .time.checkpoint import Checkpoint as Checkpoint
 from .time.explicit import RKC2 as RKC2

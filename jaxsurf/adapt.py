@@ -12,8 +12,6 @@ from .compiling import namespace
 from .stencils.method import AbstractMethod
 from .stencils.targets import Laplacian
 
-# A stencil is adapted if the weight of its centre is less than this share of all the others.
-DOMINANCE = 0.2
 # Sizes of the neighbourhoods of such points, in units of the usual one: tried in turn.
 _SIZES = (1.5, 2.25, 3.4, 0.67, 0.45)
 
@@ -41,21 +39,23 @@ def dominance(weights, residual) -> _Numbers:
     return xp.where(residual < residual_tolerance(weights.dtype), share, -np.inf)
 
 
-def share_wanted(border, share) -> _Numbers:
+def share_wanted(border, share, method: AbstractMethod) -> _Numbers:
     """What another size must reach at each point, if it is to be better at all.
 
     On a border the usual size stays unless another serves: a one-sided Laplacian has no dominant
     centre, however large.
     """
-    return namespace(share).where(border & (share > -np.inf), DOMINANCE, -np.inf)
+    return namespace(share).where(border & (share > -np.inf), method.least_dominance, -np.inf)
 
 
-def is_better(share, best, wanted) -> Bool[Array, " r"] | Bool[np.ndarray, " r"]:
+def is_better(
+    share, best, wanted, method: AbstractMethod
+) -> Bool[Array, " r"] | Bool[np.ndarray, " r"]:
     """Whether a size with this share is taken in place of the best one so far.
 
     The first size that serves is taken; if none does, that with the largest share.
     """
-    return (best < DOMINANCE) & (share > best) & (share >= wanted)
+    return (best < method.least_dominance) & (share > best) & (share >= wanted)
 
 
 def first_slots(count: Any, mask) -> Bool[Array, "*r k"] | Bool[np.ndarray, "*r k"]:

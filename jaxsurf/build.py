@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .adapt import (
-    DOMINANCE,
     dominance,
     first_slots,
     is_better,
@@ -44,12 +43,12 @@ def choose_neighbors(
 
     Every point gets the number of neighbours that the method asks for. Where the
     Laplacian's weight of the centre is then positive or small,
-    $-w_{ii} < 0.2 \sum_{j \ne i} |w_{ij}|$, or its conditions cannot be met, larger
-    neighbourhoods are tried, by half, up to three times, then smaller ones, which see less of a
-    fold. The first that serves is taken; if none does, that with the most dominant centre, on a
-    border the usual one: a one-sided Laplacian has no dominant centre, however large. Such
-    points are what gives collocation matrices eigenvalues with positive real part
-    (`experiments`, stability study).
+    $-w_{ii} < 0.2 \sum_{j \ne i} |w_{ij}|$ (with RBF-FD only where it is positive), or its
+    conditions cannot be met, larger neighbourhoods are tried, by half, up to three times, then
+    smaller ones, which see less of a fold. The first that serves is taken; if none does, that with
+    the most dominant centre, on a border the usual one: a one-sided Laplacian has no dominant
+    centre, however large. Such points are what gives collocation matrices eigenvalues with
+    positive real part (`experiments`, stability study).
 
     Args:
         cloud: n points in d dimensions with unit normals; concrete.
@@ -184,7 +183,7 @@ def _adapted(cloud, method, throw, needed=True):
     _check_sizes(cloud, neighbors, method, Laplacian(), throw)
     found = stencil_weights(cloud, neighbors, method, Laplacian())
     share = _dominance(*found)
-    poor = np.flatnonzero(on & needed & (share < DOMINANCE))
+    poor = np.flatnonzero(on & needed & (share < method.least_dominance))
     sizes = sizes_to_try(method, cloud.dim, k, available)
     border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
     if not poor.size or not sizes:
@@ -196,11 +195,11 @@ def _adapted(cloud, method, throw, needed=True):
     indices, mask = nearest_of(cloud, rows, max(sizes))
     chosen, best = np.full(rows.size, k), share[rows]
     kept = [_wider(np.asarray(a)[..., rows], max(sizes)) for a in jax.tree.leaves(found)]
-    wanted = share_wanted(border, share)[rows]
+    wanted = share_wanted(border, share, method)[rows]
     for size in sizes:
         trial = _in_chunks(cloud, indices, mask & first_slots(size, mask), method, rows)
         now = _dominance(*trial)
-        better = is_better(now, best, wanted)
+        better = is_better(now, best, wanted, method)
         best = np.where(better, now, best)
         chosen = np.where(better, size, chosen)
         kept = [np.where(better, new, old) for new, old in zip(jax.tree.leaves(trial), kept)]
@@ -243,14 +242,14 @@ def _in_chunks(cloud, indices, mask, method, rows):
 
 def _report(poor, best, border, chosen, method) -> None:
     """Warn of points inside the surface where no size serves."""
-    failed = (best < DOMINANCE) & ~border[poor]
+    failed = (best < method.least_dominance) & ~border[poor]
     if failed.any():
         worst = np.flatnonzero(failed)[np.argmin(best[failed])]
         warnings.warn(
             f"no neighbourhood of {failed.sum()} points serves {method}: the worst is point "
             f"{poor[worst]}, where the centre has a share of {best[worst]:.2g} of the weights of "
-            f"{chosen[worst]} neighbours, {DOMINANCE} is needed; the operator may have growing "
-            "modes (js.spectral_estimate)",
+            f"{chosen[worst]} neighbours, {method.least_dominance} is needed; the operator "
+            "may have growing modes (js.spectral_estimate)",
             stacklevel=4,
         )
 

@@ -159,8 +159,8 @@ def find_neighbors(
     Raises:
         TypeError: no cloud or array of points; k or capacity that are not whole numbers.
         ValueError: arrays traced by `jit` or `vmap` (use `search_neighbors`); k, radius or
-            capacity out of range (both numbers given); duplicates, lone points, mixed orientation and sheets too
-            close to be told apart (named by index).
+            capacity out of range (both numbers given); duplicates, lone points, mixed orientation
+            and sheets too close to be told apart (named by index).
 
     Example:
         >>> angle = 2 * jnp.pi * jnp.arange(50) / 50

@@ -43,9 +43,9 @@ def laplace_beltrami(
         one, which is not symmetric, approximate them, and a few of large size may come out with
         a positive real part where points are few or uneven: `js.spectral_estimate` tells.
 
-    Accuracy: error $O(h^r)$ for `DCPSE(order=r)`, $O(h^{p-1})$ for `GFDM(degree=p)`
-    (`tests/test_accuracy.py`). In float32 round-off is amplified by $1/h^2$: on 200 points the
-    values are within 2e-4 of the largest, gradients in the points within 1e-3
+    Accuracy: error $O(h^r)$ for `DCPSE(order=r)`, $O(h^{p-1})$ for `GFDM(degree=p)` and
+    `RBFFD(degree=p)` (`tests/test_accuracy.py`). In float32 round-off is amplified by $1/h^2$: on
+    200 points the values are within 2e-4 of the largest, gradients in the points within 1e-3
     (`tests/test_forms.py::test_single_precision`).
     Differentiable: forward and reverse, in points, normals and field, for fixed neighbours.
     Raises:
@@ -82,8 +82,9 @@ def surface_gradient(
     Returns:
         Operator mapping `(n, *c)` fields to `(n, *c, d)`, in units of field / length.
 
-    Accuracy: error $O(h^r)$ for `DCPSE(order=r)`, $O(h^p)$ for `GFDM(degree=p)`; in float32
-    round-off is amplified by 1/h (`tests/test_forms.py::test_single_precision`).
+    Accuracy: error $O(h^r)$ for `DCPSE(order=r)`, $O(h^p)$ for `GFDM(degree=p)` and
+    `RBFFD(degree=p)`; in float32 round-off is amplified by 1/h
+    (`tests/test_forms.py::test_single_precision`).
     Differentiable: forward and reverse, in points, normals and field, for fixed neighbours.
     Raises:
         ValueError: as `laplace_beltrami`.

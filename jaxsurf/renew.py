@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .adapt import DOMINANCE, dominance, first_slots, is_better, share_wanted, sizes_to_try
+from .adapt import dominance, first_slots, is_better, share_wanted, sizes_to_try
 from .arguments import instance, real, whole
 from .build import stencil_weights
 from .cells import distance_key
@@ -226,7 +226,7 @@ def _adapted(search, grid, rings, cloud, lists, laplacian):
     """Lists of other sizes where the usual one does not serve, and whether there are any."""
     share = dominance(*jax.lax.stop_gradient((laplacian.weights, laplacian.diagnostics.residual)))
     border = jnp.zeros(cloud.n, bool) if cloud.boundary is None else cloud.boundary
-    wanted = share_wanted(border, share)
+    wanted = share_wanted(border, share, search.method)
     most = max(search.sizes)
 
     def look(rows, _):
@@ -237,7 +237,7 @@ def _adapted(search, grid, rings, cloud, lists, laplacian):
             some = Rows(wide.indices.T, wide.mask.T & first_slots(size, wide.mask.T))
             weights, diagnostics = stencil_weights(cloud, some, search.method, Laplacian(), rows)
             now = dominance(weights, diagnostics.residual)
-            better = is_better(now, best, wanted[rows])
+            better = is_better(now, best, wanted[rows], search.method)
             return (jnp.where(better, now, best), jnp.where(better, size, chosen)), None
 
         start = (share[rows], jnp.full(len(rows), search.k))
@@ -251,7 +251,7 @@ def _adapted(search, grid, rings, cloud, lists, laplacian):
         indices = jnp.where(changed, indices, lists.indices[:, rows])
         return _Lists(indices, jnp.where(changed, mask, lists.mask[:, rows]), code), changed
 
-    poor = grid.on & (lists.code == 0) & (share < DOMINANCE)
+    poor = grid.on & (lists.code == 0) & (share < search.method.least_dominance)
     lists, changed = _for_rows(poor, look, (lists, jnp.zeros(cloud.n, bool)))
     return lists, jnp.any(changed)
 

@@ -8,9 +8,15 @@ import numpy as np
 
 import jaxsurf as js
 
-METHODS = [js.DCPSE(order=2), js.DCPSE(order=4), js.GFDM(degree=2), js.GFDM(degree=4)]
+METHODS = [
+    js.DCPSE(order=2),
+    js.DCPSE(order=4),
+    js.GFDM(degree=2),
+    js.GFDM(degree=4),
+    js.RBFFD(degree=4),
+]
 # One of each kind, for what does not hang on the order.
-KINDS = [js.DCPSE(order=2), js.GFDM(degree=4)]
+KINDS = [js.DCPSE(order=2), js.GFDM(degree=4), js.RBFFD(degree=4)]
 
 
 _COUNTS: list[list[str]] = []
@@ -43,7 +49,7 @@ def count_compilations():
 
 
 def label(method) -> str:
-    number = method.degree if isinstance(method, js.GFDM) else method.order
+    number = method.order if isinstance(method, js.DCPSE) else method.degree
     return f"{type(method).__name__}{number}"
 
 

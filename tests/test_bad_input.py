@@ -59,7 +59,7 @@ def test_mixed_orientation():
 @pytest.mark.parametrize("method", METHODS, ids=label)
 def test_too_few_neighbors(method):
     neighbors = js.find_neighbors(SPHERE, k=6 if label(method).endswith("4") else 5)
-    need = {"DCPSE2": 10, "DCPSE4": 21, "GFDM2": 6, "GFDM4": 15}[label(method)]
+    need = {"DCPSE2": 10, "DCPSE4": 21, "GFDM2": 6, "GFDM4": 15, "RBFFD4": 15}[label(method)]
     with pytest.raises(
         ValueError, match=rf"k = \d neighbours, {type(method).__name__}.*least {need}"
     ):

@@ -336,6 +336,7 @@ ONE_SIDED = [
     (js.DCPSE(order=2), js.GFDM(degree=3), "neumann", 8e-4, 1.7),
     (js.DCPSE(order=4), js.GFDM(degree=4), "neumann", 1.7e-5, 3.8),
     (js.DCPSE(order=4), js.DCPSE(order=4), "neumann", 6e-4, 3.8),
+    (js.RBFFD(degree=4), js.RBFFD(degree=4), "neumann", 2e-5, 3.7),
 ]
 
 
@@ -404,12 +405,13 @@ def test_images_of_a_sphere_lie_on_it():
 # --- stability -----------------------------------------------------------------------------
 
 
-METHODS = [js.GFDM(degree=2), js.GFDM(degree=4), js.DCPSE(order=4)]
+METHODS = [js.GFDM(degree=2), js.GFDM(degree=4), js.DCPSE(order=4), js.RBFFD(degree=4)]
 # Mirrored, each method on one of the shapes.
 SHAPES = [
     *[(make, one_sided, m) for make in (square, annulus) for m in METHODS],
     *[(square, mirrored, m) for m in (js.GFDM(degree=2), js.DCPSE(order=4))],
     (annulus, mirrored, js.GFDM(degree=4)),
+    (annulus, mirrored, js.RBFFD(degree=4)),
 ]
 
 

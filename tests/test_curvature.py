@@ -18,7 +18,9 @@ def test_torus(method):
     cloud = js.torus(6000, 3.0, 1.0)
     neighbors = js.choose_neighbors(cloud, method=method)
     mean, gauss = torus_curvature(cloud.points)
-    bound = {"DCPSE2": 8e-3, "DCPSE4": 1.5e-4, "GFDM2": 6e-3, "GFDM4": 2e-4}[label(method)]
+    bound = {"DCPSE2": 8e-3, "DCPSE4": 1.5e-4, "GFDM2": 6e-3, "GFDM4": 2e-4, "RBFFD4": 2e-4}[
+        label(method)
+    ]
     args = dict(neighbors=neighbors, method=method)
     assert relative_error(js.mean_curvature(cloud, **args), mean) < bound
     assert relative_error(js.gauss_curvature(cloud, **args), gauss) < 2 * bound
@@ -32,7 +34,9 @@ def test_torus(method):
     around /= jnp.linalg.norm(around, axis=1, keepdims=True)
     assert jnp.abs(jnp.abs(jnp.sum(around * directions[:, 0], axis=1)) - 1).max() < 10 * bound
     vector = js.mean_curvature_vector(cloud, **args)
-    assert relative_error(vector, -2 * mean[:, None] * cloud.normals) < 3 * bound
+    # Twice the mean curvature by the Laplacian, which of RBF-FD is less accurate than the gradient.
+    times = 10 if isinstance(method, js.RBFFD) else 3
+    assert relative_error(vector, -2 * mean[:, None] * cloud.normals) < times * bound
     tensor = js.shape_tensor(cloud, **args)
     np.testing.assert_allclose(jnp.einsum("nab,nb->na", tensor, cloud.normals), 0, atol=1e-12)
 

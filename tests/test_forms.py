@@ -280,7 +280,9 @@ def test_small_programs_are_the_same_in_every_form():
 
 
 @pytest.mark.core
-@pytest.mark.parametrize("method", [js.GFDM(degree=p) for p in range(2, 7)], ids=str)
+@pytest.mark.parametrize(
+    "method", [make(degree=p) for make in (js.GFDM, js.RBFFD) for p in range(2, 7)], ids=str
+)
 def test_every_polynomial_of_the_basis_is_exact(method):
     """On a plane, all monomials up to the degree: Laplacian and gradient."""
     degree = method.degree

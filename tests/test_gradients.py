@@ -18,6 +18,8 @@ VECTOR = jnp.stack([FIELD, FIELD**2, jnp.cos(FIELD)], axis=1)
 check_derivative = functools.partial(check_derivatives, compiled=False)
 each_method = pytest.mark.parametrize("method", METHODS, ids=label)
 each_kind = pytest.mark.parametrize("method", KINDS, ids=label)
+# Splines have no cut-off: RBF-FD is smooth for fixed neighbours only.
+each_with_support = pytest.mark.parametrize("method", KINDS[:2], ids=label)
 
 
 def smooth(values):
@@ -99,7 +101,7 @@ def test_field_and_coefficients():
     check_derivative(lambda s: smooth((s * laplacian).T(FIELD)), 1.0 + FIELD**2)
 
 
-@each_kind
+@each_with_support
 def test_a_neighbor_crosses_the_edge_of_the_support(method):
     """A search by radius: the lists change within the difference, the weights must not jump."""
     radius = 0.62 if label(method).endswith("4") else 0.5
@@ -124,7 +126,7 @@ def test_a_neighbor_crosses_the_edge_of_the_support(method):
     np.testing.assert_allclose(derivative, difference, rtol=1e-6)
 
 
-@each_kind
+@each_with_support
 def test_the_nearest_change(method):
     """The k nearest: a point that enters the list has no weight yet."""
     k = method.neighbor_count(3)
@@ -150,7 +152,7 @@ def test_the_nearest_change(method):
 def test_padded_and_switched_off_rows_have_finite_gradients():
     keep = np.arange(CLOUD.n) % 10 != 0
     cloud = js.PointCloud(CLOUD.points, CLOUD.normals, active=keep)
-    for method in (js.DCPSE(order=2), js.GFDM(degree=2)):
+    for method in (js.DCPSE(order=2), js.GFDM(degree=2), js.RBFFD(degree=2)):
         neighbors = js.choose_neighbors(cloud, method=method)
 
         def total(points, neighbors=neighbors, method=method):
@@ -160,6 +162,22 @@ def test_padded_and_switched_off_rows_have_finite_gradients():
         gradient = jax.jit(jax.grad(total))(CLOUD.points)
         assert jnp.isfinite(gradient).all()
         assert jnp.abs(gradient[~keep]).max() == 0 < jnp.abs(gradient[keep]).max()
+
+
+def test_compiled_tangents_of_splines():
+    """In one program with the derivative, distances are computed more than once: see `_power`."""
+    method = js.RBFFD(degree=2)
+    neighbors = js.find_neighbors(CLOUD, k=14)
+    points = CLOUD.points * jnp.array([1.0, 1.2, 1.5])
+
+    def weights(points):
+        return js.laplace_beltrami(cloud_of(points), neighbors, method=method).weights
+
+    direction = jnp.sin(jnp.arange(points.size, dtype=points.dtype)).reshape(points.shape)
+    values, tangents = jax.jit(lambda p: jax.jvp(weights, (p,), (direction,)))(points)
+    expected = weights(points), jax.jvp(weights, (points,), (direction,))[1]
+    for found, plain in zip((values, tangents), expected):
+        np.testing.assert_allclose(found, plain, atol=1e-9 * jnp.abs(plain).max())
 
 
 def test_gradient_under_vmap():

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..compiling import namespace
+from ..compiling import AnyArray, namespace
 
 
 @functools.cache
@@ -51,12 +51,12 @@ def _parents(dim: int, high: int) -> tuple[tuple[int, int], ...]:
     return tuple(parents)
 
 
-def monomials(x: Float[Array, "dim *q"], high: int) -> Float[Array, "m *q"]:
+def monomials(x: Float[AnyArray, "dim *q"], high: int) -> Float[AnyArray, "m *q"]:
     """All monomials of degree 0 to `high`, one multiplication each, a degree at a time."""
     return namespace(x).concatenate(monomials_by_degree(x, high))
 
 
-def monomials_by_degree(x: Float[Array, "dim *q"], high: int) -> list[Float[Array, "_ *q"]]:
+def monomials_by_degree(x: Float[AnyArray, "dim *q"], high: int) -> list[Float[AnyArray, "_ *q"]]:
     """The same with each degree apart."""
     dim, xp = len(x), namespace(x)
     degrees = [xp.ones_like(x[:1])]

@@ -9,9 +9,15 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..fits.moments import moment_solve
-from ..fits.monomials import polynomial_count
 from ..fits.plane import TangentPlane
-from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive, with_center
+from .method import (
+    AbstractMethod,
+    Diagnostics,
+    Neighborhood,
+    check_positive,
+    needed_polynomials,
+    with_center,
+)
 from .targets import AbstractTarget
 
 
@@ -54,13 +60,7 @@ class GFDM(AbstractMethod):
         return _SURFACE_COUNT[min(self.degree, 6)] if dim == 3 else 5 + 2 * self.degree
 
     def basis_size(self, dim, target):
-        if self.degree < target.order:
-            raise ValueError(
-                f"degree = {self.degree}: polynomials of degree at least {target.order} are needed "
-                f"for derivatives of order {target.order}, and so for the Laplacian by which "
-                "neighbours are chosen"
-            )
-        return polynomial_count(dim - 1, self.degree)
+        return needed_polynomials(self.degree, dim, target)
 
     @property
     def batch_size(self):

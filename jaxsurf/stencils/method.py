@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ..arguments import real, whole
+from ..fits.monomials import polynomial_count
 from ..fits.plane import Neighborhood, dot
 from .targets import AbstractTarget
 
@@ -93,6 +94,11 @@ class AbstractMethod(eqx.Module):
         return False
 
     @property
+    def least_dominance(self) -> float:
+        """Share of the centre among the Laplacian's weights below which a point is adapted."""
+        return 0.2
+
+    @property
     @abc.abstractmethod
     def batch_size(self) -> int:
         """How many stencils are computed at once: enough to be fast, few enough for the cache."""
@@ -113,6 +119,21 @@ def check_positive(method: AbstractMethod, **least: bool) -> None:
             whole(value, label, least=1)
         else:
             real(value, label, above=0)
+
+
+def needed_polynomials(degree: int, dim: int, target: AbstractTarget) -> int:
+    """Polynomials of a degree over the tangents, for methods that are exact on all of these.
+
+    Raises:
+        ValueError: a degree below the order of the derivatives.
+    """
+    if degree < target.order:
+        raise ValueError(
+            f"degree = {degree}: polynomials of degree at least {target.order} are needed "
+            f"for derivatives of order {target.order}, and so for the Laplacian by which "
+            "neighbours are chosen"
+        )
+    return polynomial_count(dim - 1, degree)
 
 
 def with_center(eta: Float[Array, "c k *p"]) -> Float[Array, "c k *p"]:

@@ -32,6 +32,7 @@ CASES = [
     Case("Diagonal", "complex", lambda: js.Diagonal(1j * np.ones(4)), ("factor", "complex")),
     Case("Diagonal", "a long field", lambda: js.Diagonal(jnp.ones(4))(jnp.ones(5)), ("(5,)", "4")),
     Case("identity", "of 2.5 points", lambda: js.identity(2.5), ("n", "2.5")),
+    Case("identity", "of many points", lambda: js.identity("10"), ("n", "10")),
     Case("identity", "of no points", lambda: js.identity(0), ("n", "0", "1")),
     Case(
         "Composition",

@@ -215,6 +215,16 @@ TESTED = {
         "float32": "test_operators.py::test_single_precision",
         "bad input": "malformed",
     },
+    "RBFFD": {
+        "value": "test_accuracy.py::test_convergence_on_the_sphere, "
+        + _POLYNOMIALS
+        + ", test_stability.py::test_spectrum",
+        "gradient": {"points": "test_gradients.py::test_operators_in_points_and_normals"},
+        "jit": "test_operators.py::test_jit_and_vmap_equal_the_plain_call",
+        "vmap": "test_operators.py::test_jit_and_vmap_equal_the_plain_call",
+        "float32": "test_operators.py::test_single_precision",
+        "bad input": "malformed",
+    },
     "FlatDCPSE": {
         "value": "test_flat.py::test_polynomials_are_exact",
         "gradient": {"points": "test_flat.py::test_derivative_in_points"},

@@ -180,6 +180,27 @@ def test_compiled_tangents_of_splines():
         np.testing.assert_allclose(found, plain, atol=1e-9 * jnp.abs(plain).max())
 
 
+def test_neighbors_are_found_under_grad():
+    """For the values that are differentiated: as with lists made outside, in every way to ask."""
+    method = js.GFDM(degree=2)
+    lists = js.choose_neighbors(CLOUD, method=method)
+
+    def total(points, find):
+        cloud = cloud_of(points)
+        return smooth(find(cloud)(FIELD))
+
+    given = jax.grad(total)(CLOUD.points, lambda c: js.laplace_beltrami(c, lists, method=method))
+    for find in (
+        lambda c: js.laplace_beltrami(c, method=method),
+        lambda c: js.laplace_beltrami(c, js.choose_neighbors(c, method=method), method=method),
+        lambda c: js.discretize(c, method=method).laplacian,
+    ):
+        found = jax.grad(total)(CLOUD.points, find)
+        np.testing.assert_allclose(found, given, rtol=1e-9, atol=1e-12)
+    with pytest.raises(ValueError, match="under jit and vmap"):
+        jax.jit(total, static_argnums=1)(CLOUD.points, lambda c: js.laplace_beltrami(c))
+
+
 def test_gradient_under_vmap():
     neighbors = js.choose_neighbors(CLOUD)
 

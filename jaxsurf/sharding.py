@@ -4,11 +4,13 @@ Every device owns a run of points of the cloud. Its rows read other points too, 
 gather (`stencils.gathers.take`) these are sent by their owners, and nothing else is:
 
     shards = deal(surface.neighbors, 8)
-    mesh = jax.make_mesh((8,), (shards.axis,))
-    split = functools.partial(jax.shard_map, mesh=mesh, check_vma=False)
-    apply = split(Shards.product, in_specs=(P("points"), P(None, "points"), P("points")), ...)
-    apply(shards, weights[:, shards.rows], u[shards.rows])[:n]
+    mesh, own = Mesh(jax.devices(), (shards.axis,)), PartitionSpec(shards.axis)
+    columns = PartitionSpec(None, shards.axis)
+    product = jax.shard_map(Shards.product, mesh=mesh, in_specs=(own, columns, own), out_specs=own,
+                            check_vma=False)
+    product(shards, weights[:, shards.rows], u[shards.rows])[:n]
 
+(`check_vma=False`, because the sums over slots begin with zeros that belong to no device.)
 Not public yet.
 """
 

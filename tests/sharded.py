@@ -23,18 +23,21 @@ N = 1_999  # the last device has one point less, and a copy
 STEPS = 100
 METHOD = js.GFDM(degree=2)
 
+# A result, or several in parentheses, and the operation between devices.
 COLLECTIVE = re.compile(
-    r"= \(?\w+\[([\d,]*)\]\S* "
+    r"= (\([^()]*\)|\S+) "
     r"(all-\w+(?:-\w+)*|ragged-[\w-]+|collective-[\w-]+|reduce-scatter[\w-]*|send|recv)\("
 )
+SHAPE = re.compile(r"\w+\[([\d,]*)\]")
 
 
 def sent(compiled) -> dict[str, int]:
     """Numbers that a device receives, by operation, each time its program comes to one."""
     total: dict[str, int] = {}
-    for shape, name in COLLECTIVE.findall(compiled.as_text()):
-        count = math.prod(int(size) for size in shape.split(",") if size)
-        total[name] = total.get(name, 0) + count
+    for results, name in COLLECTIVE.findall(compiled.as_text()):
+        for shape in SHAPE.findall(results):
+            count = math.prod(int(size) for size in shape.split(",") if size)
+            total[name] = total.get(name, 0) + count
     return total
 
 
@@ -58,10 +61,8 @@ def main():
         PartitionSpec(*names) for names in [(shards.axis,), (None, shards.axis), ()]
     )
 
-    def sharded(f, in_specs, out_specs):
-        return jax.jit(
-            jax.shard_map(f, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
-        )
+    on_all = functools.partial(jax.shard_map, mesh=mesh, check_vma=False)
+    compiled = lambda f, *arguments: jax.jit(f).lower(*arguments).compile()
 
     def weights_of(shards, points, normals):
         return shards.weights(points, normals, METHOD, Laplacian())
@@ -72,22 +73,29 @@ def main():
     def whole(u):
         return jax.lax.all_gather(u, shards.axis)
 
-    build = sharded(weights_of, (own, own, own), columns)
-    apply = sharded(Shards.product, (own, columns, own), own)
-    run = sharded(steps, (own, columns, own, everywhere), own)
-
     geometry = shards, cloud.points[rows], cloud.normals[rows]
+    weights_on_all = on_all(weights_of, in_specs=(own, own, own), out_specs=columns)
+    build = compiled(weights_on_all, *geometry)
+    built = build(*geometry)
+
     field = shards, weights[:, rows], u[rows]
-    built, applied = build(*geometry), apply(*field)
+    product_on_all = on_all(Shards.product, in_specs=(own, columns, own), out_specs=own)
+    product = compiled(product_on_all, *field)
+    applied = product(*field)
+
     dt = jnp.asarray(1 / size)
     start = shards, built, u[rows], dt
+    steps_on_all = on_all(steps, in_specs=(own, columns, own, everywhere), out_specs=own)
+    run = compiled(steps_on_all, *start)
     end = run(*start)
     expected = jax.jit(heat)(surface.laplacian, u, dt)
 
-    square = lambda u: jnp.sum(run(shards, built, u[rows], dt)[:N] ** 2)
+    square = lambda u: jnp.sum(steps_on_all(shards, built, u[rows], dt)[:N] ** 2)
     expected_square = lambda u: jnp.sum(heat(surface.laplacian, u, dt) ** 2)
     slope, expected_slope = (jax.jit(jax.grad(f))(u) for f in (square, expected_square))
 
+    programs = {"build": build, "product": product, "steps": run}
+    programs["whole"] = compiled(on_all(whole, in_specs=own, out_specs=own), u[rows])
     difference = lambda a, b, scale=1: float(jnp.abs(a - b).max() / scale)
     print(
         json.dumps(
@@ -101,17 +109,10 @@ def main():
                 "steps": difference(end[:N], expected, jnp.abs(expected).max()),
                 "change": difference(expected, u, jnp.abs(u).max()),
                 "gradient": difference(slope, expected_slope, jnp.abs(expected_slope).max()),
-                "sent": {
-                    name: sent(program.lower(*given).compile())
-                    for name, program, given in [
-                        ("build", build, geometry), ("product", apply, field),
-                        ("steps", run, start),
-                        ("whole", sharded(whole, own, own), field[2:]),
-                    ]
-                },
+                "sent": {name: sent(program) for name, program in programs.items()},
             }
         )
-    )  # fmt: skip
+    )
 
 
 if __name__ == "__main__":

@@ -19,7 +19,8 @@ COORDINATES = 3 + 3  # of a point and its normal
 @pytest.fixture(scope="module")
 def found(environment):
     """What `python -m tests.sharded` prints."""
-    environment = environment | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={DEVICES}"}
+    flags = f"{environment.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={DEVICES}"
+    environment = environment | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     call = [sys.executable, "-m", "tests.sharded"]
     done = subprocess.run(call, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -25,7 +25,7 @@ _SMALL = 50_000
 
 
 def take(values: Float[AnyArray, "m *c"], j: Int[AnyArray, "..."]) -> Float[AnyArray, "... *c"]:
-    """The values at these points: the only place where operators and builds read those of others.
+    """The values at these points: where operators and builds of stencils read those of others.
 
     On several devices the values are a device's own and its halo, see `sharding`.
     """

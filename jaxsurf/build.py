@@ -24,6 +24,7 @@ from .compiling import copying_jit, namespace, sized_jit
 from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .neighbors import Neighbors, Rows, find_neighbors, nearest_of, switched_on
 from .stencils.dcpse import DCPSE
+from .stencils.gathers import take
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood
 from .stencils.stencil import Stencil
 from .stencils.targets import Laplacian
@@ -126,7 +127,7 @@ def blocks_of(cloud, neighbors, rows, size: int):
     cloud, slots = cloud.seen, in_blocks(neighbors.indices.T, size)
     # One coordinate at a time: one gather for all of them is slower.
     points, normals = (
-        [_taken(column, slots) for column in vectors.T] for vectors in (cloud.points, cloud.normals)
+        [take(column, slots) for column in vectors.T] for vectors in (cloud.points, cloud.normals)
     )
     radius = neighbors.radius
     if radius is not None:
@@ -137,12 +138,6 @@ def blocks_of(cloud, neighbors, rows, size: int):
 @copying_jit
 def _turned(indices):
     return indices.T
-
-
-def _taken(column, slots):
-    if namespace(column) is np:
-        return column[slots]
-    return column.at[slots].get(mode="promise_in_bounds")
 
 
 @sized_jit

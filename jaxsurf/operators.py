@@ -13,6 +13,7 @@ from .cloud import PointCloud
 from .neighbors import Neighbors, find_neighbors
 from .stencils.algebra import Composition
 from .stencils.dcpse import DCPSE, FlatDCPSE
+from .stencils.gathers import take
 from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil
 from .stencils.targets import Gradient, Hessian, Laplacian, Partial
@@ -269,7 +270,7 @@ def _along(direction, weights):
 
 @jax.jit
 def _scalar_weights(d, _, indices, weights):
-    return _closed(weights * (d + d[indices]) / 2)
+    return _closed(weights * (d + take(d, indices)) / 2)
 
 
 @jax.jit
@@ -278,7 +279,9 @@ def _tensor_weights(d, normals, indices, weights):
     # Points last, and one entry at a time: nothing of size (k, n, d, d) is made but the stencils.
     d = jnp.einsum("nab,nbc,ncd->adn", project, (d + d.mT) / 2, project)
     entries = [(a, b) for a in range(len(d)) for b in range(len(d))]
-    return _closed(sum((d[a, b] + d[a, b][indices]) / 2 * weights[:, a, b] for a, b in entries))
+    return _closed(
+        sum((d[a, b] + take(d[a, b], indices)) / 2 * weights[:, a, b] for a, b in entries)
+    )
 
 
 def _closed(weights):

@@ -15,6 +15,7 @@ from ..arguments import as_float, finite, instance, is_concrete, switched_off
 from ..boundary import Closure
 from ..operators import divergence_of
 from ..stencils.algebra import AbstractOperator
+from ..stencils.gathers import take
 from ..stencils.stencil import Stencil
 from .coefficients import (
     InTime,
@@ -550,7 +551,7 @@ def _same_shape(value, u: Field, name: str) -> Array:
 def _along(gradient: Stencil, velocity, conservative: bool) -> Stencil:
     r"""$u \mapsto \nabla\cdot(v\,u)$ or $v\cdot\nabla u$ as one stencil."""
     v = _checked_velocity(velocity, gradient)
-    v = jnp.moveaxis(v[gradient.indices], -1, 1) if conservative else v.T[None]
+    v = jnp.moveaxis(take(v, gradient.indices), -1, 1) if conservative else v.T[None]
     weights = jnp.sum(gradient.weights * v, axis=1)
     known = (gradient.diagnostics, gradient.border, gradient.active)
     return Stencil(gradient.indices, weights, (), (), *known)

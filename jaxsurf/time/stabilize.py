@@ -13,6 +13,7 @@ from ..operators import diffusion
 from ..spectrum import spectral_estimate
 from ..stencils.algebra import AbstractOperator
 from ..stencils.dcpse import DCPSE
+from ..stencils.gathers import take
 from ..stencils.method import AbstractMethod
 from ..stencils.stencil import Stencil
 from .coefficients import check_operator
@@ -131,7 +132,7 @@ def _viscosity(spacing, velocity, strength) -> Float[Array, " n"]:
 @jax.jit
 def _nearest(points, neighbors: Neighbors) -> Float[Array, " n"]:
     """Distance to the nearest other point of each list."""
-    offsets = points[neighbors.indices] - points[:, None]
+    offsets = take(points, neighbors.indices) - points[:, None]
     squares = jnp.sum(offsets**2, axis=-1)
     other = neighbors.mask & (neighbors.indices != jnp.arange(len(points))[:, None])
     # The largest where there is no other, so that nothing is divided by zero on the way back.

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..arguments import count_on, instance, real, switched_off
 from ..boundary import Closure, check_border
@@ -48,17 +48,13 @@ class System(eqx.Module):
         operator = self.operator
         if self.conditions is not None:
             operator = operator @ self.conditions.extension
-        return operator if self._all_free else Projection(self) @ operator
-
-    @property
-    def _all_free(self) -> bool:
-        return self.conditions is None and self.operator.active is None
+        return operator if self._all_free else self.projection @ operator
 
     @property
     def matrix(self) -> AbstractOperator:
         matrix = self.reduced
         if not self._all_free:
-            matrix = matrix + (1 - Projection(self))
+            matrix = matrix + (1 - self.projection)
         return matrix if self.sigma is None else matrix - self.sigma * self.averaging
 
     def inverse(self, preconditioner: AbstractPreconditioner) -> AbstractOperator:
@@ -69,9 +65,18 @@ class System(eqx.Module):
         return off @ preconditioner @ off - (1 / self.sigma) * self.averaging
 
     @property
+    def projection(self) -> Projection:
+        """P."""
+        return Projection(self.operator.n, self.conditions, self.operator.active)
+
+    @property
     def averaging(self) -> Averaging:
         """p pᵀ / pᵀ p."""
-        return Averaging(self)
+        return Averaging(self.projection)
+
+    @property
+    def _all_free(self) -> bool:
+        return self.conditions is None and self.operator.active is None
 
     def spread(self) -> Float[Array, "*n"]:
         """One over half the row sums of moduli: the square of a distance for a Laplacian."""
@@ -85,8 +90,7 @@ class System(eqx.Module):
 
     def free(self, v):
         """P v."""
-        v = switched_off(self.operator.active, v)
-        return v if self.conditions is None else self.conditions.restrict(v)
+        return self.projection(v)
 
     def constant(self, value, dtype):
         """p times a number."""
@@ -94,13 +98,12 @@ class System(eqx.Module):
 
     def mean(self, v):
         """Over free points."""
-        return jnp.sum(self.free(v)) / self.count
+        return self.averaging.mean(v)
 
     @property
     def count(self):
         """Number of free points."""
-        bound = 0 if self.conditions is None else self.conditions.m
-        return count_on(self.operator.active, self.operator.n) - bound
+        return self.projection.count
 
     def shift(self, v):
         r"""$-\sigma$ times the mean: where the system holds, $P A E v = f - p\,$ shift(v)."""
@@ -108,36 +111,43 @@ class System(eqx.Module):
 
 
 class Projection(AbstractOperator):
-    """P of a system: symmetric."""
+    """P, which keeps the values of free points and puts zero for others: symmetric."""
 
-    system: System
+    n: int = eqx.field(static=True, default=0)
+    conditions: Closure | None = None
+    on: Bool[Array, " n"] | None = None
     in_shape = ()
     out_shape = ()
 
     @property
-    def n(self):
-        return self.system.operator.n
+    def count(self):
+        """Number of free points."""
+        return count_on(self.on, self.n) - (0 if self.conditions is None else self.conditions.m)
 
     def __call__(self, v):
-        return self.system.free(v)
+        v = switched_off(self.on, v)
+        return v if self.conditions is None else self.conditions.restrict(v)
 
     def transpose(self):
         return self
 
 
 class Averaging(AbstractOperator):
-    """p pᵀ / pᵀ p of a system, the mean at each free point: symmetric, of rank one."""
+    """The mean over the free points, at each of these: symmetric, of rank one."""
 
-    system: System
+    projection: Projection
     in_shape = ()
     out_shape = ()
 
     @property
     def n(self):
-        return self.system.operator.n
+        return self.projection.n
+
+    def mean(self, v):
+        return jnp.sum(self.projection(v)) / self.projection.count
 
     def __call__(self, v):
-        return self.system.constant(self.system.mean(v), v.dtype)
+        return self.projection(jnp.broadcast_to(self.mean(v), v.shape))
 
     def transpose(self):
         return self

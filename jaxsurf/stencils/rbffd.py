@@ -38,7 +38,7 @@ class RBFFD(AbstractMethod):
         ValueError: a degree below 1, an exponent that is even or out of range.
 
     Example:
-        >>> cloud = js.sphere(300)
+        >>> cloud = js.sphere(500)
         >>> z = cloud.points[:, 2]
         >>> operator = js.laplace_beltrami(cloud, method=js.RBFFD(degree=4))
         >>> bool(jnp.abs(operator(z) + 2 * z).max() < 0.02)

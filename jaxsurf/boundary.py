@@ -99,6 +99,9 @@ class Closure(eqx.Module):
                 values = np.asarray(found).ravel()
                 bad = (values < 0) | (values >= self.n)
                 raise_at(bad, f"{name} names point {{v}}, there are {self.n}", values)
+        if is_concrete(self.rows):
+            often = np.bincount(np.asarray(self.rows), minlength=1)
+            raise_at(often > 1, "rows names point {i} {v} times, expected once", often)
 
     def __repr__(self):
         said = ", ".join(repr(source.condition) for source in self.sources) or "no condition"
@@ -148,7 +151,7 @@ class Closure(eqx.Module):
 
     def restrict(self, u: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
         """The field with its bound values set to zero."""
-        return self._field(u).at[self.rows].set(0)
+        return self._field(u).at[self.rows].set(0, unique_indices=True)
 
     def extend(self, u: Float[Array, "p *c"], t=0.0) -> Float[Array, "n *c"]:
         """A field of the first p points, for a cloud with ghosts after them, filled in."""

@@ -176,7 +176,7 @@ class Closure(eqx.Module):
 
     def to_scipy(self) -> scipy.sparse.csr_matrix:
         """E as a CSR matrix, `(n, n)`."""
-        rows, free = np.asarray(self.rows), ~np.asarray(self.bound)
+        rows, free = np.asarray(self.rows), self._host_free
         own = np.flatnonzero(free)
         i = np.concatenate([own, np.broadcast_to(rows, self.indices.shape).ravel()])
         j = np.concatenate([own, np.asarray(self.indices).ravel()])
@@ -185,6 +185,12 @@ class Closure(eqx.Module):
         matrix = scipy.sparse.csr_matrix((values, (i, j)), shape=(self.n, self.n))
         matrix.eliminate_zeros()
         return matrix
+
+    @property
+    def _host_free(self) -> Bool[np.ndarray, " n"]:
+        free = np.ones(self.n, bool)
+        free[np.asarray(self.rows)] = False
+        return free
 
     def _field(self, u):
         u = as_float(u, "field")
@@ -235,7 +241,7 @@ class Restriction(AbstractOperator):
         return self
 
     def to_scipy(self):
-        free = ~np.asarray(self.closure.bound)
+        free = self.closure._host_free
         return scipy.sparse.diags(free.astype(self.closure.weights.dtype)).tocsr()
 
 

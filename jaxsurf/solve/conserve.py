@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, ArrayLike, Float
 
-from ..arguments import instance, is_concrete, real, without_derivatives
+from ..arguments import instance, is_concrete, real
 from ..compiling import sized_jit
 from ..stencils.lineax import Action
 from ..stencils.stencil import Stencil, prepared
@@ -68,7 +68,7 @@ def conservative_weights(
     real(total, "total", above=0)
     concrete = is_concrete(total, *jax.tree.leaves((operator, preconditioner)))
     if preconditioner is None:
-        preconditioner = multigrid(without_derivatives(operator))
+        preconditioner = multigrid(operator)
     if preconditioner.mean_zero is False:
         raise ValueError(
             "operator does not annihilate the constants: no weights are conserved, as where heat "

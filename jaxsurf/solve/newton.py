@@ -13,7 +13,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ..arguments import as_float, is_concrete, switched_off, whole, without_derivatives
+from ..arguments import as_float, is_concrete, switched_off, whole
 from ..boundary import Closure
 from ..compiling import sized_jit
 from ..functions import canonical, numbers_as_arrays
@@ -120,8 +120,7 @@ def solve_nonlinear(
     reaction = canonical(reaction, u0, args)
     problem = _Problem(operator, conditions, reaction, args, rhs)
     if preconditioner is None:
-        shifted, known = without_derivatives((operator + problem.slope(u0), conditions))
-        preconditioner = multigrid(shifted, conditions=known)
+        preconditioner = multigrid(operator + problem.slope(u0), conditions=conditions)
     if preconditioner.mean_zero:
         raise ValueError(
             "singular at u0: the operator annihilates the constants and the reaction has slope "

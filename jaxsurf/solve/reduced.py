@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
-from ..arguments import is_concrete
+from ..arguments import is_concrete, without_derivatives
 
 # Row sums up to this many times round-off are those of an operator that annihilates constants.
 _ROUNDOFF = 32
@@ -19,11 +19,11 @@ def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
     Raises:
         ValueError: traced or non-finite weights.
     """
-    leaves = jax.tree.leaves((operator, conditions))
-    if not is_concrete(*leaves):
+    operator, conditions = without_derivatives((operator, conditions))
+    if not is_concrete(*jax.tree.leaves((operator, conditions))):
         raise ValueError(
-            "multigrid is set up on arrays whose values are known: call js.multigrid or "
-            "js.step_preconditioner outside jit and vmap, and pass its result as `preconditioner`"
+            "multigrid is set up on concrete arrays: call js.multigrid or js.step_preconditioner "
+            "outside jit and vmap, and pass its result as `preconditioner`"
         )
     matrix = operator.to_scipy()
     if not np.isfinite(matrix.data).all():
@@ -32,7 +32,10 @@ def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
     if conditions is not None:
         if conditions.n != operator.n:
             raise ValueError(f"conditions for {conditions.n} points, the operator has {operator.n}")
-        matrix = conditions.reduce(operator).to_scipy()
+        restriction, extension = (
+            part.to_scipy() for part in (conditions.restriction, conditions.extension)
+        )
+        matrix = (restriction @ matrix @ extension).tocsr()
     if operator.active is not None:
         # In place: products change the order of the entries, and with it the aggregates.
         matrix.data *= np.repeat(np.asarray(operator.active), np.diff(matrix.indptr))

@@ -112,11 +112,10 @@ def solve(
     given, rtol = rtol is not None, tolerance(rtol, rhs.dtype)
     whole(max_steps, "max_steps", least=1)
     concrete = is_concrete(*jax.tree.leaves((operator, rhs, conditions, preconditioner)))
-    plain, closure = without_derivatives((operator, conditions))
     if preconditioner is None:
-        preconditioner = multigrid(plain, conditions=closure)
+        preconditioner = multigrid(operator, conditions=conditions)
     if mean_zero is None:
-        mean_zero = _is_mean_zero(plain, closure, preconditioner)
+        mean_zero = _is_mean_zero(operator, conditions, preconditioner)
     if solver is None:
         solver = BiCGStab(rtol, float(atol), np.asarray(max_steps))
     if not concrete:  # nothing concrete is differentiated
@@ -204,7 +203,8 @@ def _solve_one(rhs, operator, conditions, preconditioner, solver, limits, mean_z
 def _is_mean_zero(operator, conditions, preconditioner) -> bool:
     if preconditioner.mean_zero is not None:
         return preconditioner.mean_zero
-    if not is_concrete(*jax.tree.leaves((operator, conditions))):
+    known = without_derivatives((operator, conditions))
+    if not is_concrete(*jax.tree.leaves(known)):
         raise ValueError(
             "whether the operator annihilates the constants is not to be seen on traced arrays: "
             "pass mean_zero=True or False, or a preconditioner made outside by js.multigrid"

@@ -22,7 +22,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int, Real
 
-from .arguments import as_float, is_concrete, raise_at, real, whole
+from .arguments import as_float, count_on, is_concrete, raise_at, real, switched_off, whole
 from .conditions import Condition
 from .stencils.algebra import AbstractOperator
 
@@ -172,7 +172,7 @@ class Closure(eqx.Module):
     @property
     def restriction(self) -> Restriction:
         """P as an operator."""
-        return Restriction(self)
+        return Restriction(self.n, self)
 
     def to_scipy(self) -> scipy.sparse.csr_matrix:
         """E as a CSR matrix, `(n, n)`."""
@@ -224,25 +224,37 @@ class Extension(AbstractOperator):
 
 
 class Restriction(AbstractOperator):
-    """P: bound values set to zero."""
+    """P: the values of free points as they are, zero for others. Symmetric.
 
-    closure: Closure
+    Args:
+        n: number of points.
+        closure: whose bound points are not free; None if there are none.
+        on: nor are those where this is False; None if all are on.
+    """
+
+    n: int = eqx.field(static=True, default=0)
+    closure: Closure | None = None
+    on: Bool[Array, " n"] | None = None
     in_shape = ()
     out_shape = ()
 
     @property
-    def n(self):
-        return self.closure.n
+    def count(self):
+        """Number of free points."""
+        return count_on(self.on, self.n) - (0 if self.closure is None else self.closure.m)
 
     def __call__(self, u):
-        return self.closure.restrict(u)
+        u = switched_off(self.on, u)
+        return u if self.closure is None else self.closure.restrict(u)
 
     def transpose(self):
         return self
 
     def to_scipy(self):
-        free = self.closure._host_free
-        return scipy.sparse.diags(free.astype(self.closure.weights.dtype)).tocsr()
+        free = np.ones(self.n, bool) if self.closure is None else self.closure._host_free
+        free = free if self.on is None else free & np.asarray(self.on)
+        dtype = float if self.closure is None else self.closure.weights.dtype
+        return scipy.sparse.diags(free.astype(dtype)).tocsr()
 
 
 def _components(given) -> tuple[int, ...]:

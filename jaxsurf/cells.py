@@ -120,7 +120,7 @@ def allocate(
     points = _checked_points(points, active)
     real(radius, "radius", above=0)
     real(margin, "margin", least=1)
-    on = _all_on(points, active)
+    on = all_on(points, active)
     candidates = int(jax.jit(_candidates)(points, radius, on)[1].sum(axis=1).max())
     x = np.asarray(points, float)[np.asarray(on)]
     k = int(cKDTree(x).query_ball_point(x, radius * (1 + 1e-6), return_length=True).max())
@@ -202,7 +202,7 @@ def _search(
     points = jax.lax.stop_gradient(points)
     normals = None if normals is None else jax.lax.stop_gradient(normals)
     radius = jax.lax.stop_gradient(radius)
-    on = _all_on(points, active)
+    on = all_on(points, active)
     start, length, order = _candidates(points, radius, on)
     limit = distance_key(radius * radius)
     last = jnp.iinfo(limit.dtype).max
@@ -267,7 +267,7 @@ def _checked_points(points, active) -> Float[Array, "n d"]:
     return points
 
 
-def _all_on(points, active) -> Bool[Array, " n"]:
+def all_on(points, active) -> Bool[Array, " n"]:
     return jnp.ones(len(points), bool) if active is None else jnp.asarray(active, bool)
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .adapt import dominance, first_slots, is_better, share_wanted, sizes_to_try
 from .arguments import instance, real, whole
 from .build import stencil_weights
-from .cells import distance_key
+from .cells import all_on, distance_key
 from .checks import DETOUR, LINK, RINGS, ring_size
 from .cloud import PointCloud
 from .nearest import Grid, Nearest, nearest_in
@@ -151,7 +151,7 @@ def usual_lists(search: NeighborSearch, cloud: PointCloud, before: Neighbors):
     """Lists of the usual size, a code for each, and what others are found with."""
     grid = _grid(cloud, _reach(cloud, before, search.k, search.tiers[0].k))
     found, code = _usual(search, grid)
-    on = True if cloud.active is None else cloud.active
+    on = all_on(cloud.points, cloud.active)
     code = jnp.where(on & ~grid.on, UNREACHED, code)  # not finite
     rings = _Rings.of(grid, found)
     lists = _Lists(found.indices[: search.k], found.mask[: search.k], code)
@@ -194,7 +194,7 @@ def _reach(cloud, before, k: int, usual: int):
 
 @jax.jit
 def _grid(cloud, reach):
-    on = jnp.ones(cloud.n, bool) if cloud.active is None else cloud.active
+    on = all_on(cloud.points, cloud.active)
     return Grid.of(cloud.points, cloud.normals, on, reach)
 
 

@@ -6,10 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from ..arguments import count_on, instance, real, switched_off
-from ..boundary import Closure, check_border
+from ..arguments import instance, real
+from ..boundary import Closure, Restriction, check_border
 from ..stencils.algebra import AbstractOperator, Composition, check_scalar
 from ..stencils.stencil import Stencil
 from .precondition import AbstractPreconditioner
@@ -48,13 +48,13 @@ class System(eqx.Module):
         operator = self.operator
         if self.conditions is not None:
             operator = operator @ self.conditions.extension
-        return operator if self._all_free else self.projection @ operator
+        return operator if self._all_free else self.restriction @ operator
 
     @property
     def matrix(self) -> AbstractOperator:
         matrix = self.reduced
         if not self._all_free:
-            matrix = matrix + (1 - self.projection)
+            matrix = matrix + (1 - self.restriction)
         return matrix if self.sigma is None else matrix - self.sigma * self.averaging
 
     def inverse(self, preconditioner: AbstractPreconditioner) -> AbstractOperator:
@@ -65,14 +65,14 @@ class System(eqx.Module):
         return off @ preconditioner @ off - (1 / self.sigma) * self.averaging
 
     @property
-    def projection(self) -> Projection:
+    def restriction(self) -> Restriction:
         """P."""
-        return Projection(self.operator.n, self.conditions, self.operator.active)
+        return Restriction(self.operator.n, self.conditions, self.operator.active)
 
     @property
     def averaging(self) -> Averaging:
         """p pᵀ / pᵀ p."""
-        return Averaging(self.projection)
+        return Averaging(self.restriction)
 
     @property
     def _all_free(self) -> bool:
@@ -90,7 +90,7 @@ class System(eqx.Module):
 
     def free(self, v):
         """P v."""
-        return self.projection(v)
+        return self.restriction(v)
 
     def constant(self, value, dtype):
         """p times a number."""
@@ -103,51 +103,29 @@ class System(eqx.Module):
     @property
     def count(self):
         """Number of free points."""
-        return self.projection.count
+        return self.restriction.count
 
     def shift(self, v):
         r"""$-\sigma$ times the mean: where the system holds, $P A E v = f - p\,$ shift(v)."""
         return jnp.zeros((), v.dtype) if self.sigma is None else -self.sigma * self.mean(v)
 
 
-class Projection(AbstractOperator):
-    """P, which keeps the values of free points and puts zero for others: symmetric."""
-
-    n: int = eqx.field(static=True, default=0)
-    conditions: Closure | None = None
-    on: Bool[Array, " n"] | None = None
-    in_shape = ()
-    out_shape = ()
-
-    @property
-    def count(self):
-        """Number of free points."""
-        return count_on(self.on, self.n) - (0 if self.conditions is None else self.conditions.m)
-
-    def __call__(self, v):
-        v = switched_off(self.on, v)
-        return v if self.conditions is None else self.conditions.restrict(v)
-
-    def transpose(self):
-        return self
-
-
 class Averaging(AbstractOperator):
     """The mean over the free points, at each of these: symmetric, of rank one."""
 
-    projection: Projection
+    restriction: Restriction
     in_shape = ()
     out_shape = ()
 
     @property
     def n(self):
-        return self.projection.n
+        return self.restriction.n
 
     def mean(self, v):
-        return jnp.sum(self.projection(v)) / self.projection.count
+        return jnp.sum(self.restriction(v)) / self.restriction.count
 
     def __call__(self, v):
-        return self.projection(jnp.broadcast_to(self.mean(v), v.shape))
+        return self.restriction(jnp.broadcast_to(self.mean(v), v.shape))
 
     def transpose(self):
         return self

@@ -461,13 +461,15 @@ def per_point(value: ArrayLike, n: int, name: str) -> Float[Array, "*n"]:
 
 def either(one, other):
     """True where one of two masks is, of which either may be None."""
-    if one is None or other is None or one is other:
-        return other if one is None else one
-    return (np if is_concrete(one, other) else jnp).logical_or(one, other)
+    return _combined("logical_or", one, other)
 
 
 def both(one, other):
     """True where two masks are, of which either may be None: true everywhere."""
+    return _combined("logical_and", one, other)
+
+
+def _combined(how: str, one, other):
     if one is None or other is None or one is other:
         return other if one is None else one
-    return (np if is_concrete(one, other) else jnp).logical_and(one, other)
+    return getattr(np if is_concrete(one, other) else jnp, how)(one, other)

@@ -207,6 +207,8 @@ def _exchanged(weights, contracted: int, start: int):
 
 def table_of(indices: Int[Array, "k n"]) -> Table:
     """Where the entries of the transpose of a stencil with these indices stand; kept for them."""
+    if isinstance(indices, np.ndarray):  # might be changed
+        return jax.device_put(_table(indices))
     key = id(indices)
     known = _tables.get(key)
     if known is None or known[0]() is not indices:

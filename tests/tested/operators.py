@@ -26,6 +26,14 @@ _FIELD = {"field": "test_gradients.py::test_field_and_coefficients"}
 _DIFFUSION = _FORMS + "test_gradients_of_diffusion_in_each_argument"
 _POLYNOMIALS = _FORMS + "test_every_polynomial_of_the_basis_is_exact"
 _HIGH = _FORMS + "test_every_polynomial_of_high_degree_is_exact_inside"
+_ALGEBRA = {
+    "value": "test_algebra.py::test_operators_are_added_and_multiplied_as_matrices",
+    "gradient": {"field": "test_algebra.py::test_derivatives_in_factors_and_terms"},
+    "jit": "test_algebra.py::test_operators_are_added_and_multiplied_as_matrices",
+    "vmap": "test_algebra.py::test_derivatives_in_factors_and_terms",
+    "float32": "test_algebra.py::test_numbers_leave_the_precision_of_a_field",
+    "bad input": "malformed",
+}
 
 TESTED = {
     "PointCloud": {
@@ -174,30 +182,7 @@ TESTED = {
         "float32": _FORMS + "test_single_precision",
         "bad input": "malformed",
     },
-    "Sum": {
-        "value": "test_algebra.py::test_operators_are_added_and_multiplied_as_matrices",
-        "gradient": {"field": "test_algebra.py::test_derivatives_in_factors_and_terms"},
-        "jit": "test_algebra.py::test_operators_are_added_and_multiplied_as_matrices",
-        "vmap": "test_algebra.py::test_derivatives_in_factors_and_terms",
-        "float32": "test_algebra.py::test_numbers_leave_the_precision_of_a_field",
-        "bad input": "malformed",
-    },
-    "Diagonal": {
-        "value": "test_algebra.py::test_operators_are_added_and_multiplied_as_matrices",
-        "gradient": {"field": "test_algebra.py::test_derivatives_in_factors_and_terms"},
-        "jit": "test_algebra.py::test_operators_are_added_and_multiplied_as_matrices",
-        "vmap": "test_algebra.py::test_derivatives_in_factors_and_terms",
-        "float32": "test_algebra.py::test_numbers_leave_the_precision_of_a_field",
-        "bad input": "malformed",
-    },
-    "identity": {
-        "value": "test_algebra.py::test_operators_are_added_and_multiplied_as_matrices",
-        "gradient": {"field": "test_algebra.py::test_derivatives_in_factors_and_terms"},
-        "jit": "test_algebra.py::test_operators_are_added_and_multiplied_as_matrices",
-        "vmap": "test_algebra.py::test_derivatives_in_factors_and_terms",
-        "float32": "test_algebra.py::test_numbers_leave_the_precision_of_a_field",
-        "bad input": "malformed",
-    },
+    **dict.fromkeys(("Sum", "Diagonal", "identity"), _ALGEBRA),
     "DCPSE": {
         "value": "test_accuracy.py::test_convergence_on_the_sphere, "
         "test_forms.py::test_every_polynomial_of_the_surface_basis_is_exact, " + _HIGH,

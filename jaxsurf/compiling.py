@@ -22,6 +22,10 @@ else:
 _QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 # Numbers given to a program, in all its arrays, below which it is small.
 _SMALL = 1_750_000
+# What is computed within is computed at once, also while something else is traced. (JAX's
+# `ensure_compile_time_eval` would take apart the programs called in it as well, and compile what
+# depends on constants alone operation by operation.)
+at_once = jax.core.eval_context
 _quickly = contextvars.ContextVar("quickly", default=False)
 
 
@@ -130,7 +134,7 @@ def _is_known() -> bool:
     if jax.default_backend() != "cpu":
         return False
     try:
-        with jax.ensure_compile_time_eval():
+        with at_once():
             jax.jit(lambda: 0, compiler_options=_QUICK)()
     except (ValueError, RuntimeError):
         return False

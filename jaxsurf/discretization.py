@@ -16,7 +16,7 @@ from .borders.border import Border
 from .borders.order import find_border
 from .build import build, choose_neighbors
 from .cloud import PointCloud
-from .compiling import copying_jit
+from .compiling import at_once, copying_jit
 from .fits.monomials import polynomial_count
 from .interpolation import interpolated
 from .motion import CODES, carried, folded, judged, unreached
@@ -51,7 +51,7 @@ class _Kept:
         if not is_concrete(*jax.tree.leaves(surface)):
             return self.make(surface)
         # Also where other things are traced: this is a constant of theirs.
-        with jax.ensure_compile_time_eval():
+        with at_once():
             kept[self.name] = self.make(surface)
         return kept[self.name]
 

@@ -25,6 +25,7 @@ from .borders.border import Border, checked_border
 from .borders.order import find_border
 from .boundary import Closure, Source, check_pivots
 from .cloud import PointCloud
+from .compiling import at_once
 from .conditions import Condition, checked_conditions
 from .images import apart, reach_of, reflected
 from .stencils.dcpse import DCPSE
@@ -85,7 +86,7 @@ def with_ghosts(
     if not is_concrete(cloud.points, cloud.normals, cloud.boundary, cloud.active):
         raise ValueError("with_ghosts needs concrete points: images are found on the host")
     conditions, owned = checked_conditions(cloud, conditions)
-    with jax.ensure_compile_time_eval():  # of the points alone; values may be traced
+    with at_once():  # of the points alone; values may be traced
         border = find_border(cloud) if border is None else checked_border(border, cloud)
     _check_places(conditions, owned, border)
     declared = np.zeros(cloud.n, bool)
@@ -96,7 +97,7 @@ def with_ghosts(
     owner, place = np.full(cloud.n, -1), np.zeros(cloud.n, int)
     for number, (condition, own) in enumerate(zip(conditions, owned)):
         owner[condition.where[own]], place[condition.where[own]] = number, np.flatnonzero(own)
-    with jax.ensure_compile_time_eval():
+    with at_once():
         images = reflected(cloud, border, owner, reach_of(cloud, border, method, depth))
     if not len(images.parent):
         raise ValueError("no border point is under a condition: there is nothing to reflect")

@@ -37,6 +37,18 @@ def errors(method, n):
     return np.abs(np.asarray(found) - TORUS) / np.where(TORUS, TORUS, 4 * np.pi)
 
 
+@pytest.mark.core
+@pytest.mark.parametrize("name", ["laplacian", "areas"])
+def test_what_is_kept_is_compiled_as_whole_programs(name):
+    """And not what depends on constants alone operation by operation."""
+    cloud = js.sphere(307)
+    surface = js.discretize(cloud, js.find_neighbors(cloud, k=24), method=js.GFDM(degree=2))
+    with count_compilations() as names:
+        getattr(surface, name)
+    alone = {"jit(broadcast_in_dim)", "jit(iota)", "jit(convert_element_type)", "jit(select_n)"}
+    assert not alone & set(names), names
+
+
 @pytest.mark.filterwarnings("ignore:the surface bends")
 @pytest.mark.parametrize(
     ("method", "bounds"),

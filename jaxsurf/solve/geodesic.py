@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 from ..arguments import instance, is_concrete, raise_at, real, switched_off
 from ..build import choose_neighbors
 from ..cloud import PointCloud
-from ..compiling import sized_jit
+from ..compiling import at_once, sized_jit
 from ..discretization import Discretization
 from ..neighbors import Neighbors, find_neighbors, switched_on
 from ..stencils.gfdm import GFDM
@@ -113,7 +113,7 @@ def geodesic_distance(
     off = ~cloud.host_active
     path = _paths(jax.lax.stop_gradient(cloud.points), neighbors, indices, mask, sources, off)
     near, owners = _around(indices, sources)
-    with jax.ensure_compile_time_eval():  # of the lists alone, also where points are traced
+    with at_once():  # of the lists alone, also where points are traced
         share = _shares(mask).astype(cloud.points.dtype)
         fixed = np.isin(np.arange(cloud.n), near)
         traced = not is_concrete(cloud.points, cloud.normals)

@@ -20,6 +20,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
+from ..compiling import at_once
 from .gathers import constant_product, product, take
 
 # An entry added by a scatter costs about as much as this many padded slots.
@@ -212,7 +213,7 @@ def table_of(indices: Int[Array, "k n"]) -> Table:
     key = id(indices)
     known = _tables.get(key)
     if known is None or known[0]() is not indices:
-        with jax.ensure_compile_time_eval():  # kept, so that it must be no part of a trace
+        with at_once():  # kept, so that it must be no part of a trace
             table = jax.device_put(_table(np.asarray(indices)))
         known = weakref.ref(indices, lambda _: _tables.pop(key, None)), table
         _tables[key] = known

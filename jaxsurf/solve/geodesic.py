@@ -12,10 +12,8 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 
-from ..arguments import instance, is_concrete, raise_at, real, switched_off
+from ..arguments import instance, is_concrete, real
 from ..build import choose_neighbors
 from ..cloud import PointCloud
 from ..compiling import at_once, sized_jit
@@ -26,6 +24,7 @@ from ..stencils.lineax import Action
 from ..stencils.method import AbstractMethod
 from ..stencils.stencil import Stencil
 from .krylov import BiCGStab
+from .paths import around, path_lengths, source_indices
 from .precondition import multigrid
 
 # From this distance of their mean, in units of their root mean square, neighbours are one-sided.
@@ -97,7 +96,7 @@ def geodesic_distance(
         if neighbors.n != cloud.n:
             raise ValueError(f"neighbours of {neighbors.n} points, the cloud has {cloud.n}")
     real(smoothing, "smoothing", above=0)
-    sources = _source_indices(sources, cloud)  # type: ignore[assignment]
+    sources = source_indices(sources, cloud)  # type: ignore[assignment]
     if neighbors is None:
         neighbors = _neighbors(cloud, method)
     elif not is_concrete(neighbors.indices, neighbors.mask):
@@ -111,8 +110,8 @@ def geodesic_distance(
 
     indices, mask = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
     off = ~cloud.host_active
-    path = _paths(jax.lax.stop_gradient(cloud.points), neighbors, indices, mask, sources, off)
-    near, owners = _around(indices, sources)
+    path = path_lengths(jax.lax.stop_gradient(cloud.points), neighbors, indices, mask, sources, off)
+    near, owners = around(indices, sources)
     with at_once():  # of the lists alone, also where points are traced
         share = _shares(mask).astype(cloud.points.dtype)
         fixed = np.isin(np.arange(cloud.n), near)
@@ -308,33 +307,6 @@ def _own_in_padding(neighbors: Neighbors) -> Neighbors:
     return Neighbors(jnp.asarray(indices), neighbors.mask, neighbors.radius)
 
 
-def _source_indices(sources, cloud: PointCloud) -> Int[np.ndarray, " m"]:
-    n = cloud.n
-    if not is_concrete(sources):
-        raise ValueError("sources must be concrete arrays")
-    sources = np.asarray(sources)
-    if sources.dtype == bool:
-        if sources.shape != (n,):
-            raise ValueError(f"mask of sources has shape {sources.shape}, expected ({n},)")
-        sources = np.flatnonzero(sources)
-    elif sources.ndim != 1 or (sources.size and sources.dtype.kind not in "iu"):
-        raise TypeError(
-            f"sources is an array of {sources.dtype} of shape {sources.shape}, expected a mask or "
-            "indices"
-        )
-    sources = np.unique(sources)
-    if not sources.size:
-        raise ValueError("no sources: at least one point is needed")
-    if not (0 <= sources[0] and sources[-1] < n):
-        wrong = sources[0] if sources[0] < 0 else sources[-1]
-        raise ValueError(f"source {wrong} is not among the points 0 to {n - 1}")
-    if cloud.active is not None:
-        if not is_concrete(cloud.active):
-            raise ValueError("cloud.active must be concrete: it decides which points paths lead to")
-        raise_at(~cloud.host_active[sources], "source {v} is switched off", sources)
-    return sources
-
-
 def _spacing(points, neighbors) -> Float[Array, ""]:
     """The spacing h at which k neighbours fill a disk of area k h², or a piece k h of a curve."""
     on = neighbors.mask[:, 0]
@@ -344,68 +316,6 @@ def _spacing(points, neighbors) -> Float[Array, ""]:
     curve = points.shape[1] == 2
     squares = 12 * square / count**2 if curve else 2 * math.pi * square / count
     return jnp.sqrt(jnp.sum(squares) / jnp.sum(on))
-
-
-def _paths(points, neighbors, indices, mask, sources, off) -> Float[Array, " n"]:
-    """Length of the shortest path from a source along neighbours; that there is one is checked."""
-    concrete = is_concrete(points)
-    row, slot = np.nonzero(mask & (indices != np.arange(len(indices))[:, None]))
-    # SciPy 1.14 takes no wider index.
-    row, column = row.astype(np.int32), indices[row, slot].astype(np.int32)
-    length = np.ones(len(row))
-    if concrete:
-        x = np.asarray(points, float)
-        length = np.linalg.norm(x[column] - x[row], axis=1)
-    links = csr_array((length, (column, row)), shape=(len(indices), len(indices)))
-    path = dijkstra(links, indices=sources, min_only=True)
-    path[off] = 0
-    lost = np.flatnonzero(~np.isfinite(path))
-    if lost.size:
-        raise ValueError(
-            f"no path along neighbours leads from the sources to point {lost[0]} "
-            f"({lost.size} such points)"
-        )
-    if concrete:
-        return jax.device_put(path.astype(points.dtype))
-    return switched_off(~off, _path_length(points, neighbors, sources))
-
-
-@eqx.filter_jit
-def _path_length(points, neighbors, sources):
-    """Length of the shortest path from a source along neighbours, by relaxation."""
-    edge = jnp.linalg.norm(points[neighbors.indices] - points[:, None], axis=2)
-    edge = jnp.where(neighbors.mask, edge, jnp.inf)
-
-    def relax(carry):
-        length, _ = carry
-        shorter = jnp.min(length[neighbors.indices] + edge, axis=1)
-        return shorter, jnp.any(shorter < length)
-
-    start = jnp.full(len(points), jnp.inf, points.dtype).at[sources].set(0)
-    return jax.lax.while_loop(lambda carry: carry[1], relax, (start, jnp.array(True)))[0]
-
-
-def _around(indices, sources):
-    """Points next to a source, and for each the sources that it is next to.
-
-    Both are filled up with copies to one of few sizes, so that few programs are compiled.
-    """
-    k = indices.shape[1]
-    pairs = np.stack([indices[sources].ravel(), np.repeat(sources, k)], axis=1)
-    near, row = np.unique(pairs[:, 0], return_inverse=True)
-    order = np.argsort(row, kind="stable")
-    row, owner = row[order], pairs[order, 1]
-    first = np.searchsorted(row, np.arange(len(near)))
-    place = np.arange(len(row)) - first[row]
-    owners = np.tile(owner[first][:, None], _room(int(place.max()) + 1))
-    owners[row, place] = owner
-    full = np.minimum(np.arange(min(_room(len(near)), len(indices))), len(near) - 1)
-    return near[full].astype(np.int32), owners[full].astype(np.int32)
-
-
-def _room(count: int) -> int:
-    """The next power of two."""
-    return 1 << (count - 1).bit_length()
 
 
 def _arcs(x, n, near, owners):

@@ -14,8 +14,9 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ..arguments import as_float, instance, is_concrete, switched_off, whole
+from ..arguments import as_float, instance, switched_off, whole
 from .lineax import Action
+from .masks import both, either
 
 
 class AbstractOperator(eqx.Module):
@@ -157,11 +158,14 @@ class AbstractOperator(eqx.Module):
     @property
     def _maps(self) -> str:
         """What goes in and comes out, for `repr`."""
-        kinds = [
-            {0: "scalar", 1: "vector"}.get(len(s), "tensor")
-            for s in (self.in_shape, self.out_shape)
-        ]
-        return f"{self.n:,} points, {kinds[0]} to {kinds[1]} fields"
+        kinds = ("scalar", "vector", "tensor")
+        taken, given = (kinds[min(len(s), 2)] for s in (self.in_shape, self.out_shape))
+        return f"{self.n:,} points, {taken} to {given} fields"
+
+    def __repr__(self):
+        parts = [repr(part) for part in vars(self).values() if isinstance(part, AbstractOperator)]
+        of = f", of {' and '.join(parts)}" if parts else ""
+        return f"{type(self).__name__}({self._maps}{of})"
 
 
 class Diagonal(AbstractOperator):
@@ -207,18 +211,11 @@ class Diagonal(AbstractOperator):
         if self.factor.ndim:
             self.factor = switched_off(active, self.factor)
 
-    def __repr__(self):
-        return f"Diagonal({self._maps})"
-
-    @property
-    def out_shape(self):
-        return self.in_shape
+    out_shape = property(lambda self: self.in_shape)
 
     @property
     def diagonal(self):
-        if self.in_shape:
-            return super().diagonal
-        return jnp.broadcast_to(self.factor, self.n)
+        return super().diagonal if self.in_shape else jnp.broadcast_to(self.factor, self.n)
 
     def __call__(self, u):
         u = switched_off(self.active, self.checked(u))
@@ -230,8 +227,8 @@ class Diagonal(AbstractOperator):
         return self
 
     def to_scipy(self):
-        factor = np.broadcast_to(np.asarray(self.factor), self.n)
-        factor = factor if self.active is None else np.where(self.active, factor, 0)
+        on = True if self.active is None else np.asarray(self.active)
+        factor = np.broadcast_to(np.where(on, self.factor, 0), self.n)
         return scipy.sparse.diags(np.repeat(factor, math.prod(self.in_shape))).tocsr()
 
 
@@ -254,10 +251,9 @@ class Composition(AbstractOperator):
     """One operator after another: `(outer @ inner)(u) = outer(inner(u))`.
 
     Example:
-        >>> cloud = js.sphere(300)
-        >>> laplacian = js.laplace_beltrami(cloud)
-        >>> z = cloud.points[:, 2]
-        >>> bool(jnp.all((laplacian @ laplacian)(z) == laplacian(laplacian(z))))
+        >>> laplacian = js.laplace_beltrami(js.sphere(300))
+        >>> u = jnp.arange(300.0)
+        >>> bool(jnp.all((laplacian @ laplacian)(u) == laplacian(laplacian(u))))
         True
     """
 
@@ -265,41 +261,24 @@ class Composition(AbstractOperator):
     inner: AbstractOperator
 
     def __check_init__(self):
-        for name in ("outer", "inner"):
-            instance(getattr(self, name), AbstractOperator, name)
+        instance(self.outer, AbstractOperator, "outer")
+        instance(self.inner, AbstractOperator, "inner")
         have = (self.inner.n, self.inner.out_shape)
         want = (self.outer.n, self.outer.in_shape)
         if have != want:
             raise ValueError(f"inner operator gives (n, components) {have}, outer takes {want}")
 
-    @property
-    def n(self):
-        return self.inner.n
-
-    @property
-    def in_shape(self):
-        return self.inner.in_shape
-
-    @property
-    def out_shape(self):
-        return self.outer.out_shape
-
-    @property
-    def border(self):
-        return either(self.inner.border, self.outer.border)
-
-    @property
-    def active(self):
-        return both(self.inner.active, self.outer.active)
+    n = property(lambda self: self.inner.n)
+    in_shape = property(lambda self: self.inner.in_shape)
+    out_shape = property(lambda self: self.outer.out_shape)
+    border = property(lambda self: either(self.inner.border, self.outer.border))
+    active = property(lambda self: both(self.inner.active, self.outer.active))
 
     @property
     def diagonal(self):
         if isinstance(self.outer, Diagonal):
             return self.outer.factor * self.inner.diagonal
         return super().diagonal
-
-    def __repr__(self):
-        return f"Composition({self._maps}, of {self.outer!r} after {self.inner!r})"
 
     def __call__(self, u):
         return self.outer(self.inner(u))
@@ -325,41 +304,21 @@ class Sum(AbstractOperator):
     other: AbstractOperator
 
     def __check_init__(self):
-        for name in ("one", "other"):
-            instance(getattr(self, name), AbstractOperator, name)
+        instance(self.one, AbstractOperator, "one")
+        instance(self.other, AbstractOperator, "other")
         maps = [(o.n, o.in_shape, o.out_shape) for o in (self.one, self.other)]
         if maps[0] != maps[1]:
-            raise ValueError(
-                "operators of (n, components taken, components given) "
-                f"{maps[0]} and {maps[1]} cannot be added"
-            )
+            raise ValueError(f"operators of (n, taken, given) {maps[0]}, {maps[1]} do not add up")
 
-    @property
-    def n(self):
-        return self.one.n
-
-    @property
-    def in_shape(self):
-        return self.one.in_shape
-
-    @property
-    def out_shape(self):
-        return self.one.out_shape
-
-    @property
-    def border(self):
-        return either(self.one.border, self.other.border)
-
-    @property
-    def active(self):
-        return both(self.one.active, self.other.active)
+    n = property(lambda self: self.one.n)
+    in_shape = property(lambda self: self.one.in_shape)
+    out_shape = property(lambda self: self.one.out_shape)
+    border = property(lambda self: either(self.one.border, self.other.border))
+    active = property(lambda self: both(self.one.active, self.other.active))
 
     @property
     def diagonal(self):
         return self.one.diagonal + self.other.diagonal
-
-    def __repr__(self):
-        return f"Sum({self._maps}, of {self.one!r} and {self.other!r})"
 
     def __call__(self, u):
         return self.one(u) + self.other(u)
@@ -382,34 +341,16 @@ class Transposed(AbstractOperator):
     operator: AbstractOperator
     rows: Callable | None = None
 
-    @property
-    def n(self):
-        return self.operator.n
-
-    @property
-    def in_shape(self):
-        return self.operator.out_shape
-
-    @property
-    def out_shape(self):
-        return self.operator.in_shape
-
-    @property
-    def border(self):
-        return self.operator.border
-
-    @property
-    def active(self):
-        return self.operator.active
+    n = property(lambda self: self.operator.n)
+    in_shape = property(lambda self: self.operator.out_shape)
+    out_shape = property(lambda self: self.operator.in_shape)
+    border = property(lambda self: self.operator.border)
+    active = property(lambda self: self.operator.active)
 
     @property
     def diagonal(self):
-        if self.in_shape or self.out_shape:
-            return super().diagonal
-        return self.operator.diagonal
-
-    def __repr__(self):
-        return f"Transposed({self._maps}, of {self.operator!r})"
+        scalar = not (self.in_shape or self.out_shape)
+        return self.operator.diagonal if scalar else super().diagonal
 
     def __call__(self, v):
         v = self.checked(v)
@@ -457,19 +398,3 @@ def per_point(value: ArrayLike, n: int, name: str) -> Float[Array, "*n"]:
     if value.shape not in ((), (n,)):
         raise ValueError(f"{name} has shape {value.shape}, expected () or ({n},)")
     return value
-
-
-def either(one, other):
-    """True where one of two masks is, of which either may be None."""
-    return _combined("logical_or", one, other)
-
-
-def both(one, other):
-    """True where two masks are, of which either may be None: true everywhere."""
-    return _combined("logical_and", one, other)
-
-
-def _combined(how: str, one, other):
-    if one is None or other is None or one is other:
-        return other if one is None else one
-    return getattr(np if is_concrete(one, other) else jnp, how)(one, other)

@@ -16,8 +16,9 @@ import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
 from ..arguments import is_array, is_concrete, mask, point_indices, raise_at, switched_off
-from .algebra import AbstractOperator, Transposed, both, either, per_point
+from .algebra import AbstractOperator, Transposed, per_point
 from .gathers import product
+from .masks import both, either
 from .method import Diagnostics
 from .padded import Incoming, Table, table_of
 

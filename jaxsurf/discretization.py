@@ -2,8 +2,6 @@ r"""A surface and all that is computed from its points: operators, curvatures, i
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,10 +14,11 @@ from .borders.border import Border
 from .borders.order import find_border
 from .build import build, choose_neighbors
 from .cloud import PointCloud
-from .compiling import at_once, copying_jit
+from .compiling import copying_jit
 from .fits.monomials import polynomial_count
 from .interpolation import interpolated
-from .motion import CODES, carried, folded, judged, unreached
+from .kept import Kept
+from .motion import CODES, folded, judged, moved_cloud, unreached
 from .neighbors import Neighbors, switched_on
 from .renew import NeighborSearch, renewed
 from .stencils.algebra import Composition
@@ -27,33 +26,6 @@ from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil
 from .stencils.targets import Gradient, Joint, Laplacian
-
-
-class _Kept:
-    """A property that is computed once; anew where the surface itself is traced."""
-
-    def __init__(self, make: Callable):
-        self.make = make
-        self.__doc__ = make.__doc__
-
-    def __set_name__(self, owner, name):
-        self.name = name
-
-    def __get__(self, surface, owner=None):
-        if surface is None:
-            return self
-        kept = surface.__dict__.get("_kept")
-        if kept is None:
-            kept = {}
-            object.__setattr__(surface, "_kept", kept)
-        if self.name in kept:
-            return kept[self.name]
-        if not is_concrete(*jax.tree.leaves(surface)):
-            return self.make(surface)
-        # Also where other things are traced: this is a constant of theirs.
-        with at_once():
-            kept[self.name] = self.make(surface)
-        return kept[self.name]
 
 
 class Discretization(eqx.Module):
@@ -131,7 +103,7 @@ class Discretization(eqx.Module):
             self.cloud, diffusivity, neighbors=self.neighbors, method=self.method
         )
 
-    @_Kept
+    @Kept
     def _joint(self) -> tuple[Stencil, Stencil]:
         """Laplacian and gradient from one factorisation of the moment matrices."""
         both = self._build(Joint((Laplacian(), Gradient())))
@@ -142,11 +114,11 @@ class Discretization(eqx.Module):
             Stencil(both.indices, gradient, (self.cloud.dim,), (), *known),
         )
 
-    @_Kept
+    @Kept
     def _laplacian(self) -> Stencil:
         return self._build(Laplacian())
 
-    @_Kept
+    @Kept
     def _gradient(self) -> Stencil:
         return self._build(Gradient())
 
@@ -179,7 +151,7 @@ class Discretization(eqx.Module):
 
     # --- integrals -------------------------------------------------------------------------
 
-    @_Kept
+    @Kept
     def areas(self) -> Float[Array, " n"]:
         r"""Weights $a_i$ with $\sum_i a_i u(x_i) \approx \int_S u\,dS$, `(n,)`, in length^(d-1).
 
@@ -315,26 +287,7 @@ class Discretization(eqx.Module):
             )
         if search is not None:
             instance(search, NeighborSearch, "search", "see Discretization.search")
-        active, spacing = self.cloud.active, self.cloud.spacing
-        if active is not None:
-            points = jnp.where(active[:, None], points, self.cloud.points)
-        finite(points, "points", active)
-        if normals is None or spacing is not None:
-            old = self.cloud
-            ahead, stretch = carried(self.gradient, old.normals, old.points, points)
-            if normals is None:
-                normals = ahead
-                if active is not None:
-                    normals = jnp.where(active[:, None], ahead, old.normals)
-            if spacing is not None:
-                spacing = spacing * stretch ** (1 / (old.dim - 1))
-        cloud = PointCloud(
-            points,
-            normals,
-            boundary=self.cloud.boundary,
-            active=active,
-            spacing=spacing,
-        )
+        cloud = moved_cloud(self.cloud, points, normals, lambda: self.gradient)
         if search is None:
             found_at = self.cloud.points if self.found_at is None else self.found_at
             surface = Discretization(
@@ -362,7 +315,7 @@ class Discretization(eqx.Module):
         object.__setattr__(surface, "_kept", {name: kept})
         return surface
 
-    @_Kept
+    @Kept
     def code(self) -> Int[Array, " n"]:
         """What is wrong with each point: what would be an error outside `jit`, as a number.
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .arguments import count_on, switched_off
+from .arguments import count_on, finite, switched_off
 from .build import residual_tolerance
+from .cloud import PointCloud
 from .frames import frames_of
 
 # What a code says of a point.
@@ -23,6 +26,23 @@ _SKIN = 0.5
 
 # Each brings normals closer to where a rigid motion takes them, by the error of the gradient.
 _TURNS = 4
+
+
+def moved_cloud(cloud: PointCloud, points, normals, gradient: Callable[[], Callable]) -> PointCloud:
+    """A cloud with its points elsewhere: normals follow if None, the spacing with the area.
+
+    Args:
+        gradient: gives that of fields on the cloud as it was, if it is needed.
+    """
+    on = cloud.active
+    only = lambda new, old: new if on is None else jnp.where(on[:, None], new, old)
+    points, spacing = only(points, cloud.points), cloud.spacing
+    finite(points, "points", on)
+    if normals is None or spacing is not None:
+        ahead, stretch = carried(gradient(), cloud.normals, cloud.points, points)
+        normals = only(ahead, cloud.normals) if normals is None else normals
+        spacing = None if spacing is None else spacing * stretch ** (1 / (cloud.dim - 1))
+    return PointCloud(points, normals, boundary=cloud.boundary, active=on, spacing=spacing)
 
 
 @jax.jit

@@ -1,0 +1,37 @@
+"""Properties that are computed once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+
+from .arguments import is_concrete
+from .compiling import at_once
+
+
+class Kept:
+    """A property that is computed once; anew where the owner is traced."""
+
+    def __init__(self, make: Callable):
+        self.make = make
+        self.__doc__ = make.__doc__
+
+    def __set_name__(self, owner, name):
+        self.name = name
+
+    def __get__(self, owner, kind=None):
+        if owner is None:
+            return self
+        kept = owner.__dict__.get("_kept")
+        if kept is None:
+            kept = {}
+            object.__setattr__(owner, "_kept", kept)
+        if self.name in kept:
+            return kept[self.name]
+        if not is_concrete(*jax.tree.leaves(owner)):
+            return self.make(owner)
+        # Also where other things are traced: this is a constant of theirs.
+        with at_once():
+            kept[self.name] = self.make(owner)
+        return kept[self.name]

@@ -259,7 +259,7 @@ def test_a_border_about_which_nothing_is_said():
         js.Stencil(laplacian.indices, laplacian.weights) @ laplacian,
     ]
     left = np.flatnonzero(border)[3:]
-    words = rf"point {left[0]} lies on the border .* \({len(left)} such points\).*js.free\("
+    words = rf"point {left[0]} \(and {len(left) - 1} more\) lies on the border .*js.free\("
     for operator in operators:
         np.testing.assert_array_equal(operator.border, border)
         check_border(operator, js.close(cloud, js.free(border)))
@@ -722,7 +722,7 @@ def test_bad_conditions():
         js.dirichlet([3, 3])
     with pytest.raises(ValueError, match="value has shape"):
         js.dirichlet([3, 4], jnp.zeros(3))
-    with pytest.raises(TypeError, match="must be concrete"):
+    with pytest.raises(ValueError, match="must be concrete"):
         jax.jit(lambda m: js.dirichlet(m).m)(cloud.boundary)
     with pytest.raises(ValueError, match="no point is marked"):
         js.find_border(js.sphere(50))

@@ -264,7 +264,7 @@ def test_a_border_about_which_nothing_is_said():
         np.testing.assert_array_equal(operator.border, border)
         check_border(operator, js.close(cloud, js.free(border)))
         check_border(operator, js.close(cloud, js.neumann(border)))
-        with pytest.raises(ValueError, match=rf"point 0 lies on .* \({border.sum()} such"):
+        with pytest.raises(ValueError, match=rf"point 0 \(and {border.sum() - 1} more\) lies on"):
             check_border(operator, None)
         with pytest.raises(ValueError, match=words):
             check_border(operator, js.close(cloud, js.dirichlet(np.flatnonzero(border)[:3])))

@@ -128,7 +128,7 @@ CASES = [
             ("infinite in a component", np.array([[0.0, 1], [INF, 1]]), ("value", "point 7")),
             ("ragged", [[1.0], [1.0, 2.0]], ("value", "no array")),
             ("is a function in NumPy", lambda t: np.sin(t), ("value", "jax.numpy")),
-            ("branches on the time", lambda t: 1.0 if t > 1 else 0.0, ("value", "cannot be traced")),
+            ("branches on the time", lambda t: 1.0 if t > 1 else 0.0, ("value", "be traced")),
             ("is a function of nothing", lambda: 1.0, ("value", "function of time")),
             ("gives another length", lambda t: t * jnp.ones(5), ("value(t)", "(5,)", "(2,)")),
             ("gives complex numbers", lambda t: 1j * t, ("value(t)", "complex", "real")),

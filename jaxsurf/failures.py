@@ -77,13 +77,14 @@ def raise_at(
         bad: one for each point, `(m,)`, or one for all.
         message: with places {i} for the point, {v} for its value, {more} for how many more there
             are (else at the end), and for other values by their names.
-        values: one for each point, with further axes or not.
+        values: one for each point, with further axes or not; or one for all.
         points: which they are; None if they are counted from 0.
     """
     where = np.flatnonzero(bad)
     if where.size:
         at, told = np.unravel_index(where[0], np.shape(bad)), {"v": values} | others
-        told = {name: np.asarray(x)[at] for name, x in told.items() if f"{{{name}" in message}
+        told = {name: np.asarray(x) for name, x in told.items() if f"{{{name}" in message}
+        told = {name: x[at] if x.ndim else x[()] for name, x in told.items()}
         told["i"] = where[0] if points is None else np.asarray(points)[at]
         told["more"] = f" (and {where.size - 1} more)" if where.size > 1 else ""
         raise error((message if "{more}" in message else message + "{more}").format(**told))

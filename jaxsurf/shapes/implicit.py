@@ -12,7 +12,6 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -73,10 +72,11 @@ def project_to_level_set(
     found, step = _projected(program, points, limit, jnp.asarray(max_steps))
     if throw:
         text = (
-            f"projection of point {{i}} did not converge: last step {{v}}, tolerance {limit:.2g}, "
+            "projection of point {i} did not converge: last step {v}, tolerance {limit:.2g}, "
             f"{max_steps} steps (too far from the level set, or the gradient vanishes)"
         )
-        check(step, lambda x: ~(np.abs(x) <= np.asarray(limit)), text)
+        bad = lambda step, limit, found: ~(step <= limit)
+        check(step, bad, text, limit, found, limit=limit)
     return found
 
 
@@ -97,8 +97,8 @@ def _projected(phi: Traced, points, limit, max_steps):
             lambda _, guess: guess,
             lambda slope, y: y / slope(jnp.ones_like(y)),
         )
-        good = jnp.abs(step) <= limit
-        return jnp.where(good, start + t * g, jnp.nan), step
+        last = jnp.abs(step)
+        return jnp.where(last <= limit, start + t * g, jnp.nan), last
 
     return jax.vmap(single)(points)
 

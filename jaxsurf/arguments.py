@@ -1,103 +1,55 @@
-"""What public functions ask of their arguments, and how they say what is wrong with them.
+"""What public functions ask of their arguments.
 
 A wrong type is a `TypeError`, a wrong shape or value a `ValueError`; both name the argument, what
-it was and what is needed. Values are looked at only where arrays are concrete.
+it was and what is needed. Values are looked at only where arrays are concrete (`failures.py`).
 """
 
 from __future__ import annotations
 
 import math
 import operator
-import re
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-
-def is_concrete(*arrays: Any) -> bool:
-    """True if none of the arrays is being traced, so that their values can be looked at."""
-    return not any(isinstance(a, jax.core.Tracer) for a in arrays)
+from .failures import check, is_concrete, needs_values, not_finite, raise_at
 
 
-def without_derivatives(tree: Any) -> Any:
-    """The values that are being differentiated, where they are known: what choices are made by.
-
-    Under `grad` and `jvp` these are concrete arrays; the tracers of `jit` and `vmap` stay.
-    """
-    leaves, structure = jax.tree.flatten(tree)
-    return jax.tree.unflatten(structure, [_beneath(x) for x in leaves])
-
-
-def _beneath(x: Any) -> Any:
-    if is_concrete(x) or not jnp.issubdtype(x.dtype, jnp.inexact):
-        return x
-    seen = []
-
-    @jax.custom_jvp
-    def look(x):
-        seen.append(x)
-        return x
-
-    # A rule is called with what its transformation differentiates: one level after another.
-    look.defjvp(lambda primals, tangents: (look(*primals), *tangents))
-    look(x)
-    return seen[-1]
-
-
-def raise_at(bad: np.ndarray, message: str, values: np.ndarray) -> None:
-    """Raise a ValueError that names the first bad index, its value, and how many there are."""
-    where = np.flatnonzero(bad)
-    if where.size:
-        text = message.format(i=where[0], v=values[where[0]])
-        more = f" (and {where.size - 1} more)" if where.size > 1 else ""
-        raise ValueError(text + more)
-
-
-def refuse(x: Array, bad: Array, message: str, values: Array) -> Array:
-    """The array, but an error where there is anything bad: now, or when a compiled program runs.
+def as_float(x: Any, name: str = "array", *shapes: tuple) -> Float[Array, "..."]:
+    """The array as it is if it is of a floating-point type, else in the default one.
 
     Args:
-        bad: one for each point; concrete, or traced under `jit`, `vmap` and `grad`.
-        message: with places {i} for the point and {v} for its value.
-
-    Raises:
-        ValueError: names the first bad point, its value, and how many there are. Compiled programs
-            cannot name them: theirs is an `EquinoxRuntimeError`.
-    """
-    if is_concrete(bad):
-        raise_at(np.asarray(bad), message, np.asarray(values))
-        return x
-    return eqx.error_if(x, bad, re.sub(r"\{[iv][^}]*\}", "(to be seen outside jit)", message))
-
-
-def as_float(x: Any, name: str = "array") -> Float[Array, "..."]:
-    """The array as it is if it is of a floating-point type, else in the default one.
+        shapes: as in `shaped`; any if there are none.
 
     Raises:
         TypeError: what is no array of real numbers: complex numbers, text, objects, ragged lists.
+        ValueError: another shape.
     """
     if not isinstance(x, jax.Array):
         x = jnp.asarray(_real_numbers(x, name))
     if jnp.issubdtype(x.dtype, jnp.complexfloating):
         raise TypeError(f"{name} is complex ({x.dtype}), expected real numbers")
+    x = shaped(x, name, *shapes)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
 
 
-def on_host(x: Any, name: str = "array") -> np.ndarray:
+def on_host(x: Any, name: str = "array", *shapes: tuple) -> np.ndarray:
     """The array in NumPy and double precision, for what is done on the host.
 
+    Args:
+        shapes: as in `shaped`; any if there are none.
+
     Raises:
-        TypeError: traced, or no array of real numbers.
+        TypeError: no array of real numbers.
+        ValueError: traced, or of another shape.
     """
-    if not is_concrete(x):
-        raise TypeError(f"{name} must be concrete: give it from outside jit, vmap and grad")
+    needs_values(name, x, instead="give it from outside jit, vmap and grad")
     if isinstance(x, jax.Array):
         x = np.asarray(as_float(x, name))
-    return _real_numbers(x, name).astype(float)
+    return shaped(_real_numbers(x, name), name, *shapes).astype(float)
 
 
 def switched_off(on: Any, x: Any, value: Any = 0) -> Array:
@@ -133,25 +85,19 @@ def in_range(values: Any, name: str) -> Any:
     return values
 
 
-def finite(x: Array, name: str, on: Any = None) -> Array:
+def finite(x: Array, name: str, on: Any = None, points: Any = None) -> Array:
     """The array, of which every concrete entry must be a finite number.
 
     Args:
         on: rows that are looked at; None for all.
+        points: which points the rows are; None for all.
 
     Raises:
         ValueError: names the first row with an entry that is not.
     """
-    if is_concrete(x, on):
-        values = np.asarray(x)
-        good = np.isfinite(values)
-        if on is not None and values.shape[:1] == np.shape(on):
-            good = good | ~np.asarray(on).reshape(-1, *(1,) * (values.ndim - 1))
-        if values.ndim == 0 and not good:
-            raise ValueError(f"{name} is {values}, expected a finite number")
-        if not good.all():
-            bad = ~good.reshape(len(values), -1).all(axis=1)
-            raise_at(bad, f"{name} is not finite at point {{i}}: {{v}}", values)
+    looked_at = True if on is None or np.shape(x)[:1] != np.shape(on) else on
+    text = f"{name} is not finite{' at point {i}' if np.ndim(x) else ''}: {{v}}"
+    check(x, lambda x, on: on & not_finite(x), text, looked_at, points=points)
     return x
 
 
@@ -221,6 +167,33 @@ def instance(value: Any, kinds: type | tuple[type, ...], name: str, hint: str = 
     return value
 
 
+def shaped(x: Any, name: str, *shapes: tuple) -> Any:
+    """The array, which must be of one of these shapes, if any are named.
+
+    Args:
+        shapes: lengths of axes, with names for those of any length and ... for any number of axes:
+            `(5,)`, `("n", 2)`, `(5, ...)`.
+
+    Raises:
+        ValueError: gives its shape and those expected.
+    """
+    if shapes and not any(_fits(np.shape(x), shape) for shape in shapes):
+        expected = " or ".join(_told(shape) for shape in shapes)
+        have = "have" if name.endswith("s") and not name.endswith("ss") else "has"
+        raise ValueError(f"{name} {have} shape {np.shape(x)}, expected {expected}")
+    return x
+
+
+def as_many(what: str, n: int, other: str, wanted: int) -> None:
+    """Refuse what belongs to another number of points.
+
+    Raises:
+        ValueError: gives both numbers.
+    """
+    if n != wanted:
+        raise ValueError(f"{what} of {n} points, {other} has {wanted}")
+
+
 def mask(value: Any, n: int, name: str) -> Bool[Array, " n"]:
     """A mask over n points.
 
@@ -232,9 +205,7 @@ def mask(value: Any, n: int, name: str) -> Bool[Array, " n"]:
     if given.dtype != bool:
         what = _described(value, given)
         raise TypeError(f"{name} is {what}, expected a mask: one bool for each of {n} points")
-    if given.shape != (n,):
-        raise ValueError(f"{name} has shape {given.shape}, expected ({n},)")
-    return jnp.asarray(given)
+    return jnp.asarray(shaped(given, name, (n,)))
 
 
 def indices_of(where: Any, n: int | None, name: str) -> Int[np.ndarray, " m"]:
@@ -245,11 +216,10 @@ def indices_of(where: Any, n: int | None, name: str) -> Int[np.ndarray, " m"]:
         n: number of points; None where it is not known yet, which then is not checked.
 
     Raises:
-        TypeError: traced, or neither a mask nor indices.
-        ValueError: a mask of another length, an index out of range or given twice.
+        TypeError: neither a mask nor indices.
+        ValueError: traced, a mask of another length, an index out of range or given twice.
     """
-    if not is_concrete(where):
-        raise TypeError(f"{name} must be concrete: which points it names decides shapes")
+    needs_values(name, where, instead="which points it names decides shapes")
     given = np.asarray(where)
     if given.ndim != 1 or not (given.dtype.kind in "bui" or given.size == 0):
         raise TypeError(
@@ -278,12 +248,15 @@ def point_indices(indices: Any, name: str, *, axes: str, n: int) -> None:
         raise TypeError(f"{name} are {indices.dtype}, expected integers")
     if indices.ndim != 2 or 0 in indices.shape:
         raise ValueError(f"{name} have shape {indices.shape}, expected {axes}, both at least 1")
-    if is_concrete(indices):
-        given, count = np.asarray(indices), indices.shape[n]
-        if given.min() < 0 or given.max() >= count:
-            where = np.argwhere((given < 0) | (given >= count))[0]
-            wrong, row = given[tuple(where)], where[n]
-            raise ValueError(f"{name} of point {row} name point {wrong}, there are {count}")
+    count = indices.shape[n]
+    points = np.arange(count).reshape((-1, 1) if n == 0 else (1, -1))
+    points = np.broadcast_to(points, indices.shape)
+    text = f"{name} of point {{i}} name point {{v}}, there are {count}"
+    check(indices, lambda x: (x < 0) | (x >= count), text, points=points)
+
+
+# Shapes of points and of vectors at them.
+POINTS = (("n", 2), ("n", 3))
 
 
 def is_array(x: Any) -> bool:
@@ -311,6 +284,19 @@ def differentiable(f: Any, name: str, *arguments: jax.ShapeDtypeStruct) -> Any:
             f"{name} cannot be traced by JAX; write it with jax.numpy in place of NumPy, math and"
             f" conditions on values ({what})"
         ) from None
+
+
+def _fits(given: tuple, wanted: tuple) -> bool:
+    if ... in wanted and len(given) >= len(wanted) - 1:
+        at, after = wanted.index(...), len(given) - len(wanted) + 1
+        given, wanted = given[:at] + given[at + after :], wanted[:at] + wanted[at + 1 :]
+    pairs = zip(given, wanted)
+    return len(given) == len(wanted) and all(isinstance(w, str) or g == w for g, w in pairs)
+
+
+def _told(shape: tuple) -> str:
+    words = ["..." if a is ... else str(a) for a in shape]
+    return f"({', '.join(words)}{',' * (len(words) == 1)})"
 
 
 def _real_numbers(x: Any, name: str) -> np.ndarray:

@@ -22,8 +22,9 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int, Real
 
-from .arguments import as_float, count_on, is_concrete, raise_at, real, switched_off, whole
+from .arguments import as_float, as_many, count_on, real, switched_off, whole
 from .conditions import Condition
+from .failures import check, is_concrete, raise_at
 from .stencils.algebra import AbstractOperator
 
 # The factor of an unknown value has to be more than this share of its terms.
@@ -95,10 +96,8 @@ class Closure(eqx.Module):
                 raise ValueError(f"{name} has shape {np.shape(found)}, expected {shape}")
         for name in ("rows", "indices"):
             found = getattr(self, name)
-            if is_concrete(found):
-                values = np.asarray(found).ravel()
-                bad = (values < 0) | (values >= self.n)
-                raise_at(bad, f"{name} names point {{v}}, there are {self.n}", values)
+            outside = lambda x: (x < 0) | (x >= self.n)
+            check(found, outside, f"{name} names point {{v}}, there are {self.n}")
         if is_concrete(self.rows):
             often = np.bincount(np.asarray(self.rows), minlength=1)
             raise_at(often > 1, "rows names point {i} {v} times, expected once", often)
@@ -193,10 +192,7 @@ class Closure(eqx.Module):
         return free
 
     def _field(self, u):
-        u = as_float(u, "field")
-        if u.ndim < 1 or u.shape[0] != self.n:
-            raise ValueError(f"field has shape {u.shape}, expected ({self.n}, ...)")
-        return u
+        return as_float(u, "field", (self.n, ...))
 
     def _given(self, t) -> tuple[_Given, ...]:
         # The values here and the rest in one compiled function, which a new function of time
@@ -289,21 +285,19 @@ def check_border(operator: AbstractOperator, conditions: Closure | None) -> None
     """
     border = operator.border
     known = None if conditions is None else (conditions.declared, conditions.rows)
-    if border is None or not is_concrete(*jax.tree.leaves((border, known))):
+    if border is None or not is_concrete(border, known):
         return
     left = np.array(border)
     if conditions is not None:
-        if conditions.n != operator.n:
-            raise ValueError(f"conditions for {conditions.n} points, the operator has {operator.n}")
+        as_many("conditions", conditions.n, "the operator", operator.n)
         declared = conditions.bound if conditions.declared is None else conditions.declared
         left &= ~np.asarray(declared)
-    if left.any():
-        raise ValueError(
-            f"point {np.argmax(left)} lies on the border and is under no condition "
-            f"({int(left.sum())} such points), so that modes may grow there without bound. Close "
-            "the border, conditions=js.close(cloud, [js.neumann(...), ...]), or say that it is "
-            "free: js.close(cloud, js.free(cloud.boundary))"
-        )
+    raise_at(
+        left,
+        "point {i}{more} lies on the border and is under no condition, so that modes may grow "
+        "there without bound. Close the border, conditions=js.close(cloud, [js.neumann(...), "
+        "...]), or say that it is free: js.close(cloud, js.free(cloud.boundary))",
+    )
 
 
 def check_pivots(pivot, terms, points, what: str) -> None:
@@ -315,10 +309,7 @@ def check_pivots(pivot, terms, points, what: str) -> None:
         points: for the message, `(m,)`.
         what: the unknown with `{i}` for its point, and the factor's formula.
     """
-    bad = np.flatnonzero(~(np.abs(pivot) > _PIVOT * terms))
-    if bad.size:
-        i = bad[0]
-        raise ValueError(
-            f"the condition does not determine the {what.format(i=points[i])} = {pivot[i]:.1e}, "
-            f"its terms add up to {terms[i]:.1e} in modulus ({bad.size} such points)"
-        )
+    pivot, terms = np.asarray(pivot), np.asarray(terms)
+    text = f"the condition does not determine the {what} = {{v:.1e}}, its terms add up to "
+    text += "{terms:.1e} in modulus"
+    raise_at(~(np.abs(pivot) > _PIVOT * terms), text, pivot, points=points, terms=terms)

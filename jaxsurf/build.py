@@ -17,10 +17,11 @@ from .adapt import (
     sizes_to_try,
 )
 from .adapt import residual_tolerance as residual_tolerance
-from .arguments import instance, is_concrete, refuse, without_derivatives
+from .arguments import as_many, instance
 from .arguments import mask as checked_mask
 from .cloud import PointCloud
 from .compiling import copying_jit, namespace, sized_jit
+from .failures import is_concrete, needs_values, raise_at, refuse, without_derivatives
 from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .neighbors import Neighbors, Rows, find_neighbors, nearest_of, switched_on
 from .stencils.dcpse import DCPSE
@@ -91,7 +92,7 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     weights = None
     if neighbors is None:
         neighbors, laplacian = _adapted(cloud, method, throw)
-        if isinstance(target, Laplacian) and is_concrete(*jax.tree.leaves(cloud)):
+        if isinstance(target, Laplacian) and is_concrete(cloud):
             weights = laplacian
     _check_sizes(cloud, neighbors, method, target, throw)
     if weights is None:
@@ -166,11 +167,7 @@ def rows_of(weights, others, count: int):
 def _adapted(cloud, method, throw, needed=True):
     """Neighbours that suit the method, and the Laplacian's weights and diagnostics with them."""
     cloud = without_derivatives(cloud)
-    if not is_concrete(*jax.tree.leaves(cloud)):
-        raise ValueError(
-            "neighbors=None needs arrays whose values are known; under jit and vmap pass the "
-            "neighbours"
-        )
+    needs_values("cloud", cloud, instead="under jit and vmap pass the neighbours")
     on = cloud.host_active
     available = int(on.sum())
     k = min(method.neighbor_count(cloud.dim), available)
@@ -257,8 +254,7 @@ def _dominance(weights, diagnostics) -> np.ndarray:
 
 
 def _check_sizes(cloud, neighbors, method, target, throw) -> None:
-    if neighbors.n != cloud.n:
-        raise ValueError(f"neighbours of {neighbors.n} points, the cloud has {cloud.n}")
+    as_many("neighbours", neighbors.n, "the cloud", cloud.n)
     need = method.basis_size(cloud.dim, target)
     if throw and neighbors.k < need:
         raise ValueError(f"k = {neighbors.k} neighbours, {method} needs at least {need}")
@@ -268,16 +264,16 @@ def _check(stencil: Stencil, neighbors, method, target, dim) -> None:
     diagnostics = stencil.diagnostics
     assert diagnostics is not None
     on = np.asarray(neighbors.mask)[:, 0]
-    count, residual = np.asarray(diagnostics.count), np.asarray(diagnostics.residual)
-    bad = np.flatnonzero(on & ~(residual < residual_tolerance(residual.dtype)))
-    if bad.size:
-        i = bad[0]
-        raise ValueError(
-            f"degenerate stencil at point {i}: relative moment residual {residual[i]:.1e} with "
-            f"{count[i]} points within the support {float(diagnostics.support[i]):.3g}, {method} "
-            f"needs at least {method.basis_size(dim, target)} in general position "
-            f"({bad.size} such points)"
-        )
+    residual = np.asarray(diagnostics.residual)
+    raise_at(
+        on & ~(residual < residual_tolerance(residual.dtype)),
+        "degenerate stencil at point {i}: relative moment residual {v:.1e} with {count} points "
+        f"within the support {{support:.3g}}, {method} needs at least "
+        f"{method.basis_size(dim, target)} in general position",
+        residual,
+        count=diagnostics.count,
+        support=diagnostics.support,
+    )
     tube = np.where(on, np.asarray(diagnostics.tube), 0)
     if tube.max(initial=0) > 1:
         i = int(tube.argmax())

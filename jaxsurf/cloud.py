@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .arguments import as_float, is_array, is_concrete, mask, raise_at
+from .arguments import POINTS, as_float, is_array, mask
+from .failures import is_concrete, not_finite, not_positive, raise_at
 
 # How far the length of a normal may be from one, by the bytes of a number: what normals that were
 # written with eight digits, or normalised in single precision, are off.
@@ -63,26 +64,18 @@ class PointCloud(eqx.Module):
         active: Bool[Array, " n"] | None = None,
         spacing: Float[Array, " n"] | None = None,
     ):
-        self.points = as_float(points, "points")
-        dtype = self.points.dtype
-        shape = self.points.shape
-        if len(shape) != 2 or shape[1] not in (2, 3):
-            raise ValueError(f"points must have shape (n, 2) or (n, 3), not {shape}")
+        self.points = as_float(points, "points", *POINTS)
+        dtype, shape = self.points.dtype, self.points.shape
         if shape[0] < 1:
             raise ValueError(f"points have shape {shape}: 0 points, at least 1 is needed")
-        self.normals = as_float(normals, "normals").astype(dtype)
+        self.normals = as_float(normals, "normals", shape).astype(dtype)
         self.boundary = None if boundary is None else mask(boundary, shape[0], "boundary")
         self.active = None if active is None else mask(active, shape[0], "active")
-        self.spacing = None if spacing is None else as_float(spacing, "spacing").astype(dtype)
+        if spacing is not None:
+            spacing = as_float(spacing, "spacing", shape[:1]).astype(dtype)
+        self.spacing = spacing
 
     def __check_init__(self):
-        if not (is_array(self.points) and is_array(self.normals)):
-            return
-        shape = self.points.shape
-        if self.normals.shape != shape:
-            raise ValueError(f"normals have shape {self.normals.shape}, points {shape}")
-        if self.spacing is not None and self.spacing.shape != shape[:1]:
-            raise ValueError(f"spacing has shape {self.spacing.shape}, expected {shape[:1]}")
         if is_concrete(self.points, self.normals, self.active, self.spacing):
             self._check_values()
 
@@ -90,7 +83,7 @@ class PointCloud(eqx.Module):
         on = self.host_active
         points, normals = np.asarray(self.points), np.asarray(self.normals)
         info = np.finfo(points.dtype)
-        raise_at(on & ~np.isfinite(points).all(axis=1), "point {i} is not finite: {v}", points)
+        raise_at(on & not_finite(points), "point {i} is not finite: {v}", points)
         size, largest = np.abs(points).max(axis=1), 0.1 * float(info.max) ** 0.5
         raise_at(
             on & (size > largest),
@@ -110,9 +103,8 @@ class PointCloud(eqx.Module):
         off = ~(np.abs(length - 1) < _LENGTH[points.dtype.itemsize])
         raise_at(on & off, "normal {i} has length {v}, expected 1", np.round(length, 7))
         if self.spacing is not None:
-            spacing = np.asarray(self.spacing)
-            bad = ~(np.isfinite(spacing) & (spacing > 0))
-            raise_at(on & bad, "spacing of point {i} is {v}, expected a positive number", spacing)
+            text = "spacing of point {i} is {v}, expected a positive number"
+            raise_at(on & not_positive(np.asarray(self.spacing)), text, self.spacing)
 
     def __repr__(self):
         if not is_array(self.points):

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .arguments import is_concrete
+from .failures import is_concrete
 
 if TYPE_CHECKING:
     AnyArray = Any  # the kind that goes in comes out

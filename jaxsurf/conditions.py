@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Real
 
-from .arguments import as_float, indices_of, instance, is_concrete, raise_at
+from .arguments import as_float, as_many, differentiable, finite, indices_of, instance, shaped
 from .cloud import PointCloud
+from .failures import is_concrete, raise_at
 
 Value = (
     float | Real[Array, "*m"] | Sequence[float] | Callable[[Float[Array, ""]], Real[Array, "*m"]]
@@ -54,68 +55,41 @@ class Condition(eqx.Module):
 
     def __init__(self, where, value, *, a, b, conormals=None):
         self.where = indices_of(where, None, "where")
+        raise_at(self.where < 0, "where names point {v}: indices count from 0", self.where)
         self.of = len(where) if np.asarray(where).dtype == bool else None
-        self.value = value if callable(value) else as_float(value, "value")
-        self.a = None if a is None else as_float(a, "a")
-        self.b = None if b is None else as_float(b, "b")
-        self.conormals = None if conormals is None else as_float(conormals, "conormals")
+        m = len(self.where)
+        self.value = value if callable(value) else as_float(value, "value", (), (m,), (m, "c", ...))
+        self.a = None if a is None else as_float(a, "a", (), (m,))
+        self.b = None if b is None else as_float(b, "b", (), (m,))
+        if conormals is not None:
+            conormals = as_float(conormals, "conormals", (m, 2), (m, 3))
+        self.conormals = conormals
 
     def __check_init__(self):
-        raise_at(self.where < 0, "where names point {v}: indices count from 0", self.where)
         if not self.m and not self.is_free:
             raise ValueError("where names no point: a condition needs at least 1")
-        for name in ("a", "b"):
-            x = getattr(self, name)
-            if x is not None and x.shape not in ((), (self.m,)):
-                raise ValueError(f"{name} has shape {x.shape}, expected () or ({self.m},)")
-        if self.conormals is not None:
-            shape = self.conormals.shape
-            if len(shape) != 2 or shape[0] != self.m or shape[1] not in (2, 3):
-                raise ValueError(f"conormals have shape {shape}, expected ({self.m}, d)")
-        self._check_value()
+        self._check_function()
         for name in ("a", "b", "conormals", "value"):
-            self._check_finite(name, getattr(self, name))
+            x = getattr(self, name)
+            if x is not None and not callable(x):
+                finite(x, name, points=self.where)
         if self.conormals is not None and is_concrete(self.conormals):
             with np.errstate(over="ignore"):
                 length = np.linalg.norm(np.asarray(self.conormals), axis=1)
-            off = np.flatnonzero(~(np.abs(length - 1) < _UNIT))
-            if off.size:
-                raise ValueError(
-                    f"the conormal at point {self.where[off[0]]} has length {length[off[0]]:.7g}, "
-                    f"expected 1 ({off.size} such points)"
-                )
+            text = "the conormal at point {i} has length {v:.7g}, expected 1"
+            raise_at(~(np.abs(length - 1) < _UNIT), text, length, points=self.where)
 
-    def _check_value(self):
+    def _check_function(self):
         value = self.value
-        if not callable(value):
-            return self._check_shape(value.shape, "value")
-        try:
+        if callable(value):
             time = jax.ShapeDtypeStruct((), jnp.result_type(float))
-            found = jax.eval_shape(lambda t: jnp.asarray(value(t)), time)
-        except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
-            raise TypeError(
-                "value is a function that JAX cannot trace: write it with jax.numpy, without "
-                "branches on the time"
-            ) from error
-        except TypeError as error:
-            raise TypeError(f"value has to be a function of time to an array: {error}") from error
-        if not jnp.issubdtype(found.dtype, jnp.floating) and found.dtype.kind not in "iub":
-            raise TypeError(f"value(t) is of type {found.dtype}, expected real numbers")
-        return self._check_shape(found.shape, "value(t)")
-
-    def _check_shape(self, shape, name):
-        if shape[:1] not in ((), (self.m,)):
-            m = self.m
-            raise ValueError(f"{name} has shape {shape}, expected (), ({m},) or ({m}, c)")
-
-    def _check_finite(self, name, x):
-        if x is None or callable(x) or not is_concrete(x):
-            return
-        good = np.isfinite(np.asarray(x))
-        if not good.all():
-            i = np.argmin(good.reshape(len(good), -1).all(axis=1)) if good.ndim else 0
-            value = np.asarray(x)[i] if good.ndim else x
-            raise ValueError(f"{name} is not finite at point {self.where[i]}: {value}")
+            try:
+                found = differentiable(lambda t: jnp.asarray(value(t)), "value", time)
+            except TypeError as error:
+                raise TypeError(f"value must be a function of time to an array: {error}") from error
+            if not jnp.issubdtype(found.dtype, jnp.floating) and found.dtype.kind not in "iub":
+                raise TypeError(f"value(t) is of type {found.dtype}, expected real numbers")
+            shaped(found, "value(t)", (), (self.m,), (self.m, "c", ...))
 
     @property
     def m(self) -> int:
@@ -266,17 +240,11 @@ def checked_conditions(
     owned = []
     for number, condition in enumerate(conditions):
         where = condition.where
-        if condition.of not in (None, cloud.n):
-            raise ValueError(
-                f"condition {number} is given by a mask of {condition.of} points, the cloud has "
-                f"{cloud.n}"
-            )
-        outside = where[where >= cloud.n]
-        if outside.size:
-            raise ValueError(f"condition {number} names point {outside[0]}, there are {cloud.n}")
-        off = where[~on[where]]
-        if off.size:
-            raise ValueError(f"condition {number} names point {off[0]}, which is switched off")
+        if condition.of is not None:
+            as_many(f"condition {number} is given by a mask", condition.of, "the cloud", cloud.n)
+        text = f"condition {number} names point {{v}}, "
+        raise_at(where >= cloud.n, f"{text}there are {cloud.n}", where)
+        raise_at(~on[where], f"{text}which is switched off", where)
         _check_agreement(conditions, number, owner, place)
         fresh = owner[where] < 0
         owner[where[fresh]], place[where[fresh]] = number, np.flatnonzero(fresh)
@@ -308,13 +276,12 @@ def _check_agreement(conditions, number, owner, place) -> None:
             continue
         here = np.flatnonzero(owner[new.where] == other)
         there = place[new.where[here]]
-        differ = _differ(conditions[other], there, new, here)
-        if differ.any():
-            i = new.where[here[np.argmax(differ)]]
-            raise ValueError(
-                f"point {i} is bound by condition {other} and by condition {number}, which do "
-                f"not agree ({int(differ.sum())} such points); name each point once"
-            )
+        raise_at(
+            _differ(conditions[other], there, new, here),
+            f"point {{i}} is bound by condition {other} and by condition {number}, which do not "
+            "agree{more}; name each point once",
+            points=new.where[here],
+        )
 
 
 def _differ(one: Condition, i, two: Condition, j) -> Bool[np.ndarray, " p"]:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .arguments import count_on, instance, switched_off
+from .arguments import as_many, count_on, instance, switched_off
 from .cloud import PointCloud
 from .compiling import sized_jit
 from .frames import frames_of
@@ -262,8 +262,7 @@ def tube_ratio(cloud: PointCloud, neighbors: Neighbors) -> Float[Array, " n"]:
 
     instance(cloud, PointCloud, "cloud")
     instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
-    if neighbors.n != cloud.n:
-        raise ValueError(f"neighbors of {neighbors.n} points, the cloud has {cloud.n}")
+    as_many("neighbors", neighbors.n, "the cloud", cloud.n)
     cloud, neighbors = cloud.seen, switched_on(cloud, neighbors)
     return _bend(cloud.points, cloud.normals, neighbors.indices.T, neighbors.mask.T)
 

@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from . import curvature, operators, quadrature
-from .arguments import as_float, finite, instance, is_concrete, raise_at, switched_off
+from .arguments import as_float, as_many, finite, instance, switched_off
 from .borders.border import Border
 from .borders.order import find_border
 from .build import build, choose_neighbors
 from .cloud import PointCloud
 from .compiling import copying_jit
+from .failures import is_concrete, needs_values, raise_at
 from .fits.monomials import polynomial_count
 from .interpolation import interpolated
 from .kept import Kept
@@ -58,10 +59,7 @@ class Discretization(eqx.Module):
     def __check_init__(self):
         if not isinstance(self.cloud, PointCloud):
             return  # a pytree of something else, as transformations make them
-        if self.neighbors.n != self.cloud.n:
-            raise ValueError(
-                f"neighbors of {self.neighbors.n} points, the cloud has {self.cloud.n}"
-            )
+        as_many("neighbors", self.neighbors.n, "the cloud", self.cloud.n)
 
     def __repr__(self):
         return f"Discretization({self.cloud!r}, {self.neighbors!r}, {self.method!r})"
@@ -215,17 +213,12 @@ class Discretization(eqx.Module):
                 than the neighbours reach (named by index).
         """
         u = self._field(u)
-        points = as_float(points, "points")
-        if points.ndim != 2 or points.shape[1] != self.cloud.dim:
-            raise ValueError(f"points have shape {points.shape}, expected (m, {self.cloud.dim})")
-        finite(points, "points")
+        points = finite(as_float(points, "points", ("m", self.cloud.dim)), "points")
         degree = self.method.polynomial_degree
         return interpolated(self.cloud, self.neighbors, degree, points, u)
 
     def _field(self, u) -> Float[Array, "n *c"]:
-        u = as_float(u, "field")
-        if u.ndim < 1 or u.shape[0] != self.n:
-            raise ValueError(f"field has shape {u.shape}, expected ({self.n}, ...)")
+        u = as_float(u, "field", (self.n, ...))
         return switched_off(self.cloud.active, u)
 
     # --- motion ----------------------------------------------------------------------------
@@ -243,8 +236,7 @@ class Discretization(eqx.Module):
             TypeError: a margin that is no number, slots that are not a whole number.
             ValueError: a margin below 1, fewer slots than the method asks for; a traced surface.
         """
-        if not is_concrete(*jax.tree.leaves(self)):
-            raise ValueError("search needs a concrete surface: call it outside jit")
+        needs_values("the surface", self)
         return NeighborSearch.allocated(self.cloud, self.neighbors, self.method, margin, slots)
 
     def moved(
@@ -280,11 +272,7 @@ class Discretization(eqx.Module):
                 that fold the surface, or that their lists do not serve. Under `jit`, `vmap` and
                 `grad` see `code`.
         """
-        points = as_float(points, "points")
-        if points.shape != self.cloud.points.shape:
-            raise ValueError(
-                f"points have shape {points.shape}, expected {self.cloud.points.shape}"
-            )
+        points = as_float(points, "points", self.cloud.points.shape)
         if search is not None:
             instance(search, NeighborSearch, "search", "see Discretization.search")
         cloud = moved_cloud(self.cloud, points, normals, lambda: self.gradient)
@@ -300,7 +288,7 @@ class Discretization(eqx.Module):
             )
         else:
             surface = self._renewed(cloud, search)
-        if is_concrete(*jax.tree.leaves(surface)):
+        if is_concrete(surface):
             surface.check()
         return surface
 

@@ -6,8 +6,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from .arguments import as_float, is_concrete, raise_at
+from .arguments import as_float
 from .compiling import AnyArray, namespace
+from .failures import is_concrete, raise_at
 
 
 def tangent_frames(normals: Float[Array, "*n d"]) -> Float[Array, "*n d d"]:
@@ -34,9 +35,7 @@ def tangent_frames(normals: Float[Array, "*n d"]) -> Float[Array, "*n d d"]:
         >>> js.tangent_frames(jnp.array([[0.0, 1.0]]))[0].tolist()
         [[1.0, -0.0], [0.0, 1.0]]
     """
-    normals = as_float(normals, "normals")
-    if normals.ndim < 1 or normals.shape[-1] not in (2, 3):
-        raise ValueError(f"normals must have shape (n, 2) or (n, 3), not {normals.shape}")
+    normals = as_float(normals, "normals", (..., 2), (..., 3))
     if is_concrete(normals):
         length = np.atleast_1d(np.linalg.norm(np.asarray(normals), axis=-1))
         off = ~(np.abs(length - 1) < 100 * np.sqrt(np.finfo(normals.dtype).eps))

@@ -20,13 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .arguments import instance, is_concrete
+from .arguments import instance
 from .borders.border import Border, checked_border
 from .borders.order import find_border
 from .boundary import Closure, Source, check_pivots
 from .cloud import PointCloud
 from .compiling import at_once
 from .conditions import Condition, checked_conditions
+from .failures import is_concrete, needs_values, raise_at
 from .images import apart, reach_of, reflected
 from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod
@@ -83,8 +84,7 @@ def with_ghosts(
     """
     instance(cloud, PointCloud, "cloud")
     instance(method, AbstractMethod, "method", "as js.GFDM(degree=2)")
-    if not is_concrete(cloud.points, cloud.normals, cloud.boundary, cloud.active):
-        raise ValueError("with_ghosts needs concrete points: images are found on the host")
+    needs_values("cloud", cloud, instead="images are found on the host")
     conditions, owned = checked_conditions(cloud, conditions)
     with at_once():  # of the points alone; values may be traced
         border = find_border(cloud) if border is None else checked_border(border, cloud)
@@ -114,11 +114,12 @@ def _check_places(conditions, owned, border) -> None:
     on_border = np.asarray(border.points)
     for number, (condition, own) in enumerate(zip(conditions, owned)):
         off = np.setdiff1d(condition.where[own], on_border)
-        if condition.b is not None and off.size:
-            raise ValueError(
-                f"condition {number} takes a derivative at point {off[0]}, which is not on the "
-                f"border ({off.size} such points): images need a border"
-            )
+        raise_at(
+            np.full(off.shape, condition.b is not None),
+            f"condition {number} takes a derivative at point {{v}}, which is not on the border"
+            "{more}: images need a border",
+            off,
+        )
 
 
 def _values(cloud, images, conditions, owned, place, throw):

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
-from .arguments import is_concrete, refuse
 from .build import blocks_of, determined, neighborhood, rows_of
 from .cloud import PointCloud
 from .compiling import sized_jit
+from .failures import is_concrete, refuse
 from .fits.moments import blockwise, in_blocks, moment_solve
 from .fits.monomials import monomials
 from .fits.plane import TangentPlane

@@ -8,13 +8,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from xml.sax.saxutils import escape
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Shaped
 
-from jaxsurf.arguments import in_range, instance, is_concrete, raise_at, real, whole
+from jaxsurf.arguments import in_range, instance, real, shaped, whole
 from jaxsurf.cloud import PointCloud
+from jaxsurf.failures import needs_values, not_finite, raise_at
 from jaxsurf.formats.by_suffix import contents_of
 from jaxsurf.formats.contents import Contents
 from jaxsurf.formats.through_meshio import meshio
@@ -149,13 +149,11 @@ def _from_points(contents: Contents, n, spacing, degree: int) -> PointCloud:
     own = {k: _own(k, contents.fields[k]) for k in _OWN if k in contents.fields}
     on = np.asarray(own.get("active", np.ones(len(points), bool)))
     names = np.flatnonzero(on)
-    raise_at(on & ~np.isfinite(points).all(axis=1), "point {i} is not finite: {v}", points)
+    raise_at(on & not_finite(points), "point {i} is not finite: {v}", points)
     in_range(points[on], "points")
     first, group = merge_equal(points[on])
-    again = np.flatnonzero(first[group] != np.arange(len(names)))
-    if again.size:
-        i, j = names[first[group[again[0]]]], names[again[0]]
-        raise ValueError(f"points {i} and {j} coincide ({again.size} such points)")
+    again = first[group] != np.arange(len(names))
+    raise_at(again, "points {v} and {i} coincide", names[first[group]], points=names)
     if normals is not None:
         normals = _unit(normals, on)
         # Plane curves are kept in space by formats that know nothing else.
@@ -279,8 +277,8 @@ def write(
     suffix = path.suffix.lower()
     if suffix not in (".vtu", ".vtk", ".ply", ".xyz"):
         raise ValueError(f"{path}: unknown suffix {path.suffix!r}; written are .vtu .vtk .ply .xyz")
-    if not is_concrete(*jax.tree.leaves((cloud, dict(given)))):
-        raise TypeError("cloud and fields must be concrete: write files outside jit and grad")
+    instead = "write files outside jit and grad"
+    needs_values("cloud and fields", cloud, dict(given), instead=instead)
     if not cloud.n:
         raise ValueError("cloud has 0 points, at least 1 is needed")
     points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
@@ -335,11 +333,8 @@ def _in_space(name: str, field: object, cloud: PointCloud) -> np.ndarray:
         value = np.asarray(field)
     except ValueError as error:  # ragged
         raise TypeError(f"field {name!r} is no array of numbers: {error}") from None
-    if value.ndim not in (1, 2, 3) or value.shape[0] != cloud.n:
-        raise ValueError(f"field {name!r} has shape {value.shape}, expected ({cloud.n}, ...)")
-    if value.ndim == 3 and value.shape[1:] != (cloud.dim, cloud.dim):
-        d = cloud.dim
-        raise ValueError(f"tensor {name!r} has shape {value.shape}, expected ({cloud.n}, {d}, {d})")
+    n, d = cloud.n, cloud.dim
+    shaped(value, f"field {name!r}", (n,), (n, "c"), (n, d, d))
     if value.dtype == bool:
         value = value.astype(np.uint8)
     if value.dtype.kind not in "iuf" and value.dtype != jnp.bfloat16:

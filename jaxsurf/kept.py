@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import jax
-
-from .arguments import is_concrete
 from .compiling import at_once
+from .failures import is_concrete
 
 
 class Kept:
@@ -29,7 +27,7 @@ class Kept:
             object.__setattr__(owner, "_kept", kept)
         if self.name in kept:
             return kept[self.name]
-        if not is_concrete(*jax.tree.leaves(owner)):
+        if not is_concrete(owner):
             return self.make(owner)
         # Also where other things are traced: this is a constant of theirs.
         with at_once():

@@ -9,19 +9,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .arguments import (
-    as_float,
-    finite,
-    is_array,
-    is_concrete,
-    point_indices,
-    raise_at,
-    real,
-    whole,
-    without_derivatives,
-)
+from .arguments import POINTS, as_float, finite, is_array, point_indices, real, shaped, whole
 from .checks import check_count, check_orientation, check_overlap, check_spacing, two_sheets
 from .cloud import PointCloud
+from .failures import check, is_concrete, needs_values, not_positive, raise_at, without_derivatives
 from .sheets import distance_key, judge, nearest, without_islands
 
 
@@ -62,8 +53,7 @@ class Neighbors(eqx.Module):
         point_indices(self.indices, "indices", axes="(n, k)", n=0)
         if self.mask.dtype != bool:
             raise TypeError(f"mask is {self.mask.dtype}, expected bool")
-        if self.mask.shape != self.indices.shape:
-            raise ValueError(f"mask has shape {self.mask.shape}, indices {self.indices.shape}")
+        shaped(self.mask, "mask", self.indices.shape)
         if is_concrete(self.indices, self.mask):
             first, used = np.asarray(self.indices)[:, 0], np.asarray(self.mask)
             raise_at(
@@ -78,12 +68,9 @@ class Neighbors(eqx.Module):
             )
         radius = self.radius
         if radius is not None and is_array(radius):
-            if radius.shape not in ((), (self.n,)):
-                raise ValueError(f"radius has shape {radius.shape}, expected () or ({self.n},)")
-            if is_concrete(radius):
-                reach = np.broadcast_to(np.asarray(radius), self.n)
-                text = "radius of point {i} is {v}, expected a positive number"
-                raise_at(~(np.isfinite(reach) & (reach > 0)), text, reach)
+            shaped(radius, "radius", (), (self.n,))
+            text = "radius" + " of point {i}" * radius.ndim + " is {v}, expected a positive number"
+            check(radius, not_positive, text)
 
     def __repr__(self):
         about = f"{self.n:,} points, {self.k} slots"
@@ -172,11 +159,8 @@ def find_neighbors(
     if (k is None) == (radius is None):
         raise ValueError("give exactly one of k and radius")
     cloud = without_derivatives(cloud)
-    if not is_concrete(*jax.tree.leaves((cloud, radius))):
-        raise ValueError(
-            "find_neighbors needs arrays whose values are known, and a radius that is not "
-            "differentiated; under jit and vmap use search_neighbors"
-        )
+    needs_values("cloud", cloud, instead="under jit and vmap use search_neighbors")
+    needs_values("radius", radius, instead="nothing is differentiated in it")
     if k is not None and capacity is not None:
         raise ValueError("capacity belongs to a search by radius; with k the rows have k slots")
     if k is not None:
@@ -186,9 +170,7 @@ def find_neighbors(
     real(min_cosine, "min_cosine", least=-1, most=1)
     surface = isinstance(cloud, PointCloud)
     if not isinstance(cloud, PointCloud):
-        flat = as_float(cloud, "cloud")
-        if flat.ndim != 2 or flat.shape[1] not in (2, 3):
-            raise ValueError(f"points must have shape (n, 2) or (n, 3), not {flat.shape}")
+        flat = shaped(as_float(cloud, "cloud"), "points", *POINTS)
         cloud = PointCloud(flat, jnp.zeros_like(flat).at[:, 0].set(1))
     on = cloud.host_active
     rows = np.flatnonzero(on)
@@ -203,9 +185,7 @@ def find_neighbors(
     if k is not None:
         slots, mask = nearest(points, normals, tree, k, min_cosine)
     else:
-        given = finite(as_float(radius, "radius"), "radius")
-        if given.shape not in ((), (cloud.n,)):
-            raise ValueError(f"radius has shape {given.shape}, expected () or ({cloud.n},)")
+        given = finite(as_float(radius, "radius", (), (cloud.n,)), "radius")
         reach = np.broadcast_to(np.asarray(given, points.dtype), cloud.n)
         raise_at(on & ~(reach > 0), "radius of point {i} is {v}, expected a positive number", reach)
         slots, mask = _within(points, normals, tree, reach[rows], capacity, min_cosine, rows)
@@ -275,13 +255,9 @@ def _within(points, normals, tree, radius, capacity, min_cosine: float, names):
     order = np.lexsort((found, key, row))
     row, found = row[order], found[order]
     count = np.bincount(row, minlength=n)
-    most = int(count.max(initial=1))
-    if capacity is not None and most > capacity:
-        raise ValueError(
-            f"point {names[np.argmax(count)]} has {most} neighbours within the radius, "
-            f"capacity is {capacity}"
-        )
-    width = most if capacity is None else capacity
+    width = int(count.max(initial=1)) if capacity is None else capacity
+    text = f"point {{i}} has {{v}} neighbours within the radius, capacity is {capacity}"
+    raise_at(count > width, text, count, points=names)
     slots = np.tile(np.arange(n)[:, None], width)
     mask = np.arange(width) < count[:, None]
     slots[mask] = found

@@ -11,18 +11,19 @@ from jaxtyping import Array, Bool, Float
 from scipy.spatial import cKDTree
 
 from .arguments import (
+    POINTS,
     as_float,
+    as_many,
     in_range,
     instance,
-    is_concrete,
     mask,
-    raise_at,
     switched_off,
     whole,
 )
 from .checks import check_count, check_spacing
 from .cloud import PointCloud
 from .compiling import sized_jit
+from .failures import check, is_concrete, needs_values, not_finite, raise_at
 from .fits.kernels import bell, enclosing
 from .fits.monomials import polynomial_count
 from .fits.plane import TangentPlane, dot
@@ -135,12 +136,9 @@ def estimate_normals(
     if orient:
         guess = orient_normals(x.astype(float), guess, tree)
     slots, found = nearest(x, guess, tree, k, 0.0 if orient else -1.0)
-    few = np.flatnonzero(found.sum(axis=1) < needed)
-    if few.size:
-        raise ValueError(
-            f"point {few[0]} has {found[few[0]].sum()} neighbours on its side of the surface, "
-            f"degree {degree} needs at least {needed} ({few.size} such points)"
-        )
+    count, needs = found.sum(axis=1), f"degree {degree} needs at least {needed}"
+    text = f"point {{i}} has {{v}} neighbours on its side of the surface, {needs}"
+    raise_at(count < needed, text, count)
     normals, pivot, turn = _settle(points, guess, slots, found, degree, iterations)
     eps = float(jnp.finfo(points.dtype).eps)
     raise_at(
@@ -213,23 +211,16 @@ def refit_normals(
         True
     """
     instance(neighbors, Neighbors, "neighbors", "js.find_neighbors(cloud, k) makes some")
-    points, normals = _checked_shape(points), as_float(normals, "normals")
-    if normals.shape != points.shape:
-        raise ValueError(f"normals have shape {normals.shape}, points {points.shape}")
-    n = len(points)
-    if neighbors.n != n:
-        raise ValueError(f"neighbors are those of {neighbors.n} points, there are {n}")
+    points = as_float(points, "points", *POINTS)
+    normals, n = as_float(normals, "normals", points.shape), len(points)
+    as_many("neighbors", neighbors.n, "the surface", n)
     whole(iterations, "iterations", least=1)
     whole(batch_size, "batch_size", least=1)
     needed = polynomial_count(points.shape[1] - 1, whole(degree, "degree", least=1))
     _check_fit(neighbors.k, degree, needed)
     on, count = neighbors.mask[:, 0], neighbors.mask.sum(axis=1)
-    if is_concrete(count):
-        raise_at(
-            np.asarray(on & (count < needed)),
-            f"point {{i}} has {{v}} neighbours, degree {degree} needs at least {needed}",
-            np.asarray(count),
-        )
+    text = f"point {{i}} has {{v}} neighbours, degree {degree} needs at least {needed}"
+    check(count, lambda count, on: on & (count < needed), text, on)
     radius = neighbors.radius
     if radius is not None:
         radius = jnp.broadcast_to(jnp.asarray(radius, points.dtype), n)
@@ -240,33 +231,22 @@ def refit_normals(
     determined = pivot > needed * jnp.finfo(points.dtype).eps
     fitted = jnp.where(determined[:, None], fitted, jnp.nan)
     cosine = jnp.sum(fitted * normals, axis=1)
+    text = (
+        "the fit turned the normal of point {i} over (cosine {v:.2f} with the one given): "
+        "the points do not resolve the surface there, use more points or a lower degree"
+    )
+    check(cosine, lambda cosine, on: on & ~(cosine > 0), text, on)
     if is_concrete(cosine, on):
-        raise_at(
-            np.asarray(on) & ~(np.asarray(cosine) > 0),
-            "the fit turned the normal of point {i} over (cosine {v:.2f} with the one given): "
-            "the points do not resolve the surface there, use more points or a lower degree",
-            np.asarray(cosine),
-        )
         return switched_off(on, fitted, given)
     bad = on & ((count < needed) | ~(cosine > 0))
     return switched_off(on, jnp.where(bad[:, None], jnp.nan, fitted), given)
 
 
-def _checked_shape(points) -> Float[Array, "n d"]:
-    points = as_float(points, "points")
-    if points.ndim != 2 or points.shape[1] not in (2, 3):
-        raise ValueError(f"points must have shape (n, 2) or (n, 3), not {points.shape}")
-    return points
-
-
 def _checked_points(points) -> Float[Array, "n d"]:
-    if not is_concrete(points):
-        raise ValueError(
-            "estimate_normals needs concrete points; under jit, vmap or grad use refit_normals"
-        )
-    points = _checked_shape(points)
+    needs_values("points", points, instead="under jit, vmap or grad use refit_normals")
+    points = as_float(points, "points", *POINTS)
     x = np.asarray(points)
-    raise_at(~np.isfinite(x).all(axis=1), "point {i} is not finite: {v}", x)
+    raise_at(not_finite(x), "point {i} is not finite: {v}", x)
     in_range(x, "points")
     return points
 

@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .arguments import instance, is_concrete
+from .arguments import as_many, instance, shaped
 from .borders.border import Border, checked_border
 from .borders.order import find_border, inward
 from .boundary import Closure, Source, check_pivots
 from .build import residual_tolerance, stencil_weights
 from .cloud import PointCloud
 from .conditions import Condition, checked_conditions
+from .failures import is_concrete, needs_values, raise_at
 from .neighbors import Neighbors, Rows, nearest_of
 from .stencils.gfdm import GFDM
 from .stencils.method import AbstractMethod
@@ -98,9 +99,7 @@ def close(
             if throw and is_concrete(w, a, b):
                 size = np.abs(a) + np.abs(b) * np.abs(w).sum(axis=0)
                 _check_stencils(rows, near, diagnostics.residual, method, cloud.dim)
-                check_pivots(
-                    np.asarray(pivot), np.asarray(size), rows, "value at point {i}: a + b w_i"
-                )
+                check_pivots(pivot, size, rows, "value at point {i}: a + b w_i")
         parts.append((rows, slots, weights / pivot))
         place = jnp.arange(start, start + m)
         sources.append(Source(place, 1 / pivot, jnp.asarray(np.flatnonzero(own)), condition))
@@ -113,8 +112,7 @@ def check_parts(cloud, neighbors, border) -> None:
     """Refuse neighbours and borders that are none, or of another cloud."""
     if neighbors is not None:
         instance(neighbors, Neighbors, "neighbors", "made by js.find_neighbors")
-        if neighbors.n != cloud.n:
-            raise ValueError(f"neighbours of {neighbors.n} points, the cloud has {cloud.n}")
+        as_many("neighbours", neighbors.n, "the cloud", cloud.n)
     if border is not None:
         checked_border(border, cloud)
 
@@ -141,12 +139,12 @@ def _conormals(cloud, condition, rows, own, border) -> Float[Array, "m d"]:
     place = np.full(cloud.n, -1)
     if border is not None:
         place[np.asarray(border.points)] = np.arange(len(border.points))
-    lacking = place[rows] < 0
-    if lacking.any():
-        raise ValueError(
-            f"no conormal at point {rows[np.argmax(lacking)]}: it is not on the border of the "
-            f"cloud ({int(lacking.sum())} such points); mark it in `boundary` or give conormals"
-        )
+    raise_at(
+        place[rows] < 0,
+        "no conormal at point {i}{more}: it is not on the border of the cloud; mark it in "
+        "`boundary` or give conormals",
+        points=rows,
+    )
     assert border is not None
     return border.conormals(cloud)[place[rows]]
 
@@ -157,30 +155,22 @@ _OFF = 0.05
 
 def _check_conormals(cloud, condition) -> None:
     """Given conormals have to be tangent to the surface, and to lead out of it at its border."""
-    conormals, where = condition.conormals, condition.where
-    if conormals.shape[1] != cloud.dim:
-        raise ValueError(f"conormals have shape {conormals.shape}, expected (..., {cloud.dim})")
+    conormals = shaped(condition.conormals, "conormals", (..., cloud.dim))
+    where = condition.where
     if not is_concrete(conormals, cloud.points, cloud.normals, cloud.boundary):
         return
     nu, normals = np.asarray(conormals), np.asarray(cloud.normals)[where]
     normal = np.abs(np.einsum("md,md->m", nu, normals))
-    bad = np.flatnonzero(normal > _OFF)
-    if bad.size:
-        raise ValueError(
-            f"the conormal at point {where[bad[0]]} is not tangent to the surface: its normal part "
-            f"is {normal[bad[0]]:.3g}, expected at most {_OFF} ({bad.size} such points)"
-        )
+    text = "the conormal at point {i} is not tangent to the surface: its normal part is {v:.3g}, "
+    raise_at(normal > _OFF, f"{text}expected at most {_OFF}", normal, points=where)
     if cloud.boundary is None:
         return
     at_border = np.flatnonzero(np.asarray(cloud.boundary)[where])
     inside = inward(np.asarray(cloud.points), np.flatnonzero(cloud.host_active), where[at_border])
     along = np.einsum("md,md->m", nu[at_border], inside)
-    bad = np.flatnonzero(along > 0.3 * np.linalg.norm(inside, axis=1))
-    if bad.size:
-        raise ValueError(
-            f"the conormal at point {where[at_border[bad[0]]]} leads into the surface, expected "
-            f"outward ({bad.size} such points)"
-        )
+    bad = along > 0.3 * np.linalg.norm(inside, axis=1)
+    text = "the conormal at point {i} leads into the surface, expected outward"
+    raise_at(bad, text, points=where[at_border])
 
 
 def _free_neighbors(cloud, rows, free, neighbors, method) -> Rows:
@@ -188,23 +178,18 @@ def _free_neighbors(cloud, rows, free, neighbors, method) -> Rows:
     need = method.basis_size(cloud.dim, Gradient())
     radius = None
     if neighbors is None:
-        if not is_concrete(cloud.points, cloud.normals):
-            raise ValueError("neighbors=None needs concrete arrays; under jit pass the neighbours")
+        needs_values("cloud", cloud, instead="under jit pass the neighbours")
         indices, mask = _nearest_free(cloud, rows, free, method.neighbor_count(cloud.dim))
     else:
-        if not is_concrete(neighbors.indices, neighbors.mask):
-            raise ValueError("neighbours must be concrete: which points are free decides shapes")
-        indices, mask = (np.asarray(x)[rows] for x in (neighbors.indices, neighbors.mask))
+        lists = neighbors.indices, neighbors.mask
+        needs_values("neighbors", lists, instead="which points are free decides shapes")
+        indices, mask = (np.asarray(x)[rows] for x in lists)
         indices, mask = _compacted(indices, mask & (free[indices] | (indices == rows[:, None])))
         if neighbors.radius is not None:
             radius = jnp.broadcast_to(neighbors.radius, cloud.n)
     count = mask.sum(axis=1)
-    if count.min() < need:
-        i = int(np.argmin(count))
-        raise ValueError(
-            f"point {rows[i]} has {count[i] - 1} free neighbours, {method} needs at least "
-            f"{need - 1} besides the point itself ({int(np.sum(count < need))} such points)"
-        )
+    text = f"point {{i}} has {{v}} free neighbours, {method} needs at least {need - 1} besides it"
+    raise_at(count < need, text, count - 1, points=rows)
     indices = np.where(mask, indices, indices[:, 1:2])
     return Rows(jnp.asarray(indices), jnp.asarray(mask), radius)
 
@@ -231,11 +216,12 @@ def _compacted(indices, mask, k=None):
 
 def _check_stencils(rows, near, residual, method, dim) -> None:
     residual = np.asarray(residual)
-    bad = np.flatnonzero(~(residual < residual_tolerance(residual.dtype)))
-    if bad.size:
-        i = bad[0]
-        raise ValueError(
-            f"degenerate one-sided stencil at point {rows[i]}: relative moment residual "
-            f"{residual[i]:.1e} with {int(near.mask[i].sum()) - 1} free neighbours, {method} needs "
-            f"{method.basis_size(dim, Gradient()) - 1} in general position ({bad.size} such points)"
-        )
+    raise_at(
+        ~(residual < residual_tolerance(residual.dtype)),
+        "degenerate one-sided stencil at point {i}: relative moment residual {v:.1e} with {count} "
+        f"free neighbours, {method} needs {method.basis_size(dim, Gradient()) - 1} in general "
+        "position",
+        residual,
+        points=rows,
+        count=np.asarray(near.mask).sum(axis=1) - 1,
+    )

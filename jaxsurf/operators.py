@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .arguments import as_float, finite, instance, is_concrete, raise_at, switched_off, whole
+from .arguments import POINTS, as_float, finite, instance, switched_off, whole
 from .build import build
 from .cloud import PointCloud
+from .failures import is_concrete, raise_at
 from .neighbors import Neighbors, find_neighbors
 from .stencils.algebra import Composition
 from .stencils.dcpse import DCPSE, FlatDCPSE
@@ -239,11 +240,8 @@ def diffusion(
 
 
 def _checked_diffusivity(diffusivity, cloud) -> Float[Array, "*n"]:
-    d = as_float(diffusivity, "diffusivity")
-    n, dim = cloud.n, cloud.dim
-    if d.shape not in ((n,), (n, dim, dim)):
-        shapes = f"({n},) or ({n}, {dim}, {dim})"
-        raise ValueError(f"diffusivity has shape {d.shape}, expected {shapes}")
+    n, dim = cloud.points.shape
+    d = as_float(diffusivity, "diffusivity", (n,), (n, dim, dim))
     finite(d, "diffusivity", cloud.active)
     if not is_concrete(d, cloud.active):
         return d
@@ -359,9 +357,7 @@ def partial_derivative(
         >>> bool(jnp.allclose(d_xy(points[:, 0] * points[:, 1]), 1))
         True
     """
-    points = as_float(points, "points")
-    if points.ndim != 2 or points.shape[1] not in (2, 3):
-        raise ValueError(f"points must have shape (n, 2) or (n, 3), not {points.shape}")
+    points = as_float(points, "points", *POINTS)
     instance(method, FlatDCPSE, "method")
     dim = points.shape[1]
     if not isinstance(alpha, tuple | list):
@@ -379,7 +375,4 @@ def partial_derivative(
 
 
 def _field(values, shape: tuple[int, ...], name: str):
-    values = as_float(values, name)
-    if values.shape not in (shape, shape[1:]):
-        raise ValueError(f"{name} has shape {values.shape}, expected {shape}")
-    return jnp.broadcast_to(values, shape)
+    return jnp.broadcast_to(as_float(values, name, shape, shape[1:]), shape)

@@ -8,6 +8,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.spatial import cKDTree
 
 from .checks import check_orientation
+from .failures import raise_at
 
 # Neighbours used for the first guess: one ring and a half, so that thin parts stay apart.
 _NEAR = {2: 5, 3: 13}
@@ -32,12 +33,9 @@ def plane_normals(points: np.ndarray, tree: cKDTree, *, k: int | None = None) ->
     w = np.exp(-2 * (distance[:, 1:] / distance[:, -1:]) ** 2)
     value, axes = np.linalg.eigh(np.einsum("nk,nki,nkj->nij", w, d, d))
     # In space two axes must carry the neighbours, or they all lie on a line.
-    line = np.flatnonzero(value[:, -2] < 1e-8 * value[:, -1]) if dim == 3 else np.empty(0, int)
-    if line.size:
-        raise ValueError(
-            f"the {count} nearest points around point {line[0]} lie on a line "
-            f"({line.size} such points): they determine no normal"
-        )
+    line = (value[:, -2] < 1e-8 * value[:, -1]) & (dim == 3)
+    text = f"the {count} nearest points around point {{i}} lie on a line{{more}}: they determine "
+    raise_at(line, f"{text}no normal")
     return axes[:, :, 0]
 
 

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float, Real
 from scipy.spatial import cKDTree
 
-from jaxsurf.arguments import instance, on_host, raise_at, real, whole
+from jaxsurf.arguments import instance, on_host, real, whole
 from jaxsurf.cloud import PointCloud
+from jaxsurf.failures import raise_at
 from jaxsurf.raster import CLAY, Raster, camera_of, rasterize
 
 if TYPE_CHECKING:
@@ -194,9 +195,7 @@ class _Scene(NamedTuple):
 
 
 def _checked(field, cloud: PointCloud, name: str) -> np.ndarray:
-    values, on = on_host(field, name), cloud.host_active
-    if values.shape != (cloud.n,):
-        raise ValueError(f"{name} has shape {values.shape}, expected ({cloud.n},)")
+    values, on = on_host(field, name, (cloud.n,)), cloud.host_active
     raise_at(on & ~np.isfinite(values), f"{name} is {{v}} at point {{i}}", values)
     return values[on]
 

@@ -20,10 +20,10 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Bool, Float
 
-from .arguments import is_concrete, refuse
 from .build import blocks_of, determined, neighborhood, rows_of
 from .cloud import PointCloud
 from .compiling import sized_jit
+from .failures import is_concrete, refuse
 from .fits.moments import blockwise, in_blocks, moment_solve
 from .fits.monomials import differentiation, monomials_by_degree, polynomial_count
 from .fits.plane import TangentPlane

@@ -52,9 +52,7 @@ class Raster(NamedTuple):
 
 
 def _direction(value, name: str) -> np.ndarray:
-    vector = on_host(value, name)
-    if vector.shape != (3,):
-        raise ValueError(f"{name} has shape {vector.shape}, expected (3,)")
+    vector = on_host(value, name, (3,))
     length = np.linalg.norm(vector)
     if not (np.isfinite(length) and length > 0):
         raise ValueError(f"{name} = {value} has length {length}, expected a direction")

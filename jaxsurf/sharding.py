@@ -24,9 +24,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .arguments import instance, is_concrete, whole
+from .arguments import instance, whole
 from .build import stencil_weights
 from .cloud import PointCloud
+from .failures import needs_values
 from .neighbors import Neighbors, Rows
 from .stencils.gathers import product, take
 from .stencils.method import AbstractMethod
@@ -101,8 +102,7 @@ def deal(neighbors: Neighbors, devices: int, axis: str = "points") -> Shards:
             a radius, which is not dealt out yet.
     """
     instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
-    if not is_concrete(neighbors.indices, neighbors.mask):
-        raise ValueError("neighbors are traced: who reads whom is planned on the host")
+    needs_values("neighbors", neighbors, instead="who reads whom is planned on the host")
     if neighbors.radius is not None:
         raise ValueError("neighbors were found within a radius, expected the k nearest")
     n, k = neighbors.n, neighbors.k

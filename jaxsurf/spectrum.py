@@ -6,11 +6,11 @@ import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from .arguments import instance, is_concrete, whole
+from .arguments import instance, whole
+from .failures import needs_values, raise_at
 from .stencils.algebra import AbstractOperator, Composition, check_scalar
 
 # Operators on fewer points are treated as matrices.
@@ -69,8 +69,8 @@ def spectral_estimate(operator: AbstractOperator, *, steps: int = 40, degree: in
     with almost the same real part, as of advection) a warning says so, and `residual` how far
     it came.
     Raises:
-        TypeError: no operator, a traced one.
-        ValueError: an operator with components, weights that are not finite.
+        TypeError: no operator.
+        ValueError: an operator with components, a traced one, weights that are not finite.
 
     Example:
         >>> spectrum = js.spectral_estimate(js.laplace_beltrami(js.sphere(1_000)))
@@ -80,8 +80,7 @@ def spectral_estimate(operator: AbstractOperator, *, steps: int = 40, degree: in
     instance(operator, AbstractOperator, "operator")
     check_scalar(operator)
     steps, degree = whole(steps, "steps", least=8), whole(degree, "degree", least=1)
-    if not is_concrete(*jax.tree.leaves(operator)):
-        raise TypeError("operator is traced; its spectrum is estimated outside of jit and grad")
+    needs_values("operator", operator, instead="spectra are estimated outside jit and grad")
     on = slice(None) if operator.active is None else np.flatnonzero(np.asarray(operator.active))
     apply, scale = _scaled(operator, on)
     n = len(np.arange(operator.n)[on])
@@ -293,9 +292,9 @@ def _scaled(operator: AbstractOperator, on) -> tuple[Callable, float]:
         matrix = matrix[on][:, on]
     matrix.sum_duplicates()
     names = np.arange(operator.n)[on]
-    bad = np.repeat(names, np.diff(matrix.indptr))[~np.isfinite(matrix.data)]
-    if bad.size:
-        raise ValueError(f"operator has weights that are not finite at point {bad[0]}")
+    rows = np.repeat(names, np.diff(matrix.indptr))
+    text = "operator has weights that are not finite at point {i}"
+    raise_at(~np.isfinite(matrix.data), text, points=rows)
     largest = abs(matrix.data).max(initial=0)
     if largest == 0:
         return lambda v: 0 * v, 0.0

@@ -33,9 +33,9 @@ def test_normals_of_the_wrong_length(length):
 
 
 def test_wrong_shapes():
-    with pytest.raises(ValueError, match=r"\(n, 2\) or \(n, 3\), not \(5, 4\)"):
+    with pytest.raises(ValueError, match=r"\(5, 4\), expected \(n, 2\) or \(n, 3\)"):
         js.PointCloud(np.ones((5, 4)), np.ones((5, 4)))
-    with pytest.raises(ValueError, match=r"normals have shape \(299, 3\), points \(300, 3\)"):
+    with pytest.raises(ValueError, match=r"normals have shape \(299, 3\), expected \(300, 3\)"):
         js.PointCloud(SPHERE.points, SPHERE.normals[1:])
     with pytest.raises(ValueError, match=r"spacing has shape \(2,\)"):
         js.PointCloud(SPHERE.points, SPHERE.normals, spacing=np.ones(2))

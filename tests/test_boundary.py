@@ -259,16 +259,16 @@ def test_a_border_about_which_nothing_is_said():
         js.Stencil(laplacian.indices, laplacian.weights) @ laplacian,
     ]
     left = np.flatnonzero(border)[3:]
-    words = rf"point {left[0]} lies on the border .* \({len(left)} such points\).*js.free\("
+    words = rf"point {left[0]} \(and {len(left) - 1} more\) lies on the border .*js.free\("
     for operator in operators:
         np.testing.assert_array_equal(operator.border, border)
         check_border(operator, js.close(cloud, js.free(border)))
         check_border(operator, js.close(cloud, js.neumann(border)))
-        with pytest.raises(ValueError, match=rf"point 0 lies on .* \({border.sum()} such"):
+        with pytest.raises(ValueError, match=rf"point 0 \(and {border.sum() - 1} more\) lies on"):
             check_border(operator, None)
         with pytest.raises(ValueError, match=words):
             check_border(operator, js.close(cloud, js.dirichlet(np.flatnonzero(border)[:3])))
-    with pytest.raises(ValueError, match="conditions for 81 points, the operator has 49"):
+    with pytest.raises(ValueError, match="conditions of 81 points, the operator has 49"):
         small = square(7)
         check_border(js.laplace_beltrami(small, method=method), js.close(cloud, js.free(border)))
     # Nothing to say of closed surfaces, of bare stencils, of points that are switched off, and of
@@ -722,7 +722,7 @@ def test_bad_conditions():
         js.dirichlet([3, 3])
     with pytest.raises(ValueError, match="value has shape"):
         js.dirichlet([3, 4], jnp.zeros(3))
-    with pytest.raises(TypeError, match="must be concrete"):
+    with pytest.raises(ValueError, match="must be concrete"):
         jax.jit(lambda m: js.dirichlet(m).m)(cloud.boundary)
     with pytest.raises(ValueError, match="no point is marked"):
         js.find_border(js.sphere(50))

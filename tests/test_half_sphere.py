@@ -48,7 +48,7 @@ def asked(half, conditions):
     ["solve", "solve_nonlinear", "eigenmodes", "heat", "transport", "transport in time"],
 )
 def test_nothing_is_said_about_the_border(half, name):
-    with pytest.raises(ValueError, match=r"under no condition .*js\.close.*js\.free"):
+    with pytest.raises(ValueError, match=r"under no condition.*js\.close.*js\.free"):
         asked(half, None)[name]()
 
 

@@ -322,7 +322,7 @@ def test_bad_surfaces(tmp_path):
         read(path)
     fins = np.concatenate([cube_mesh().triangles, [[0, 1, 6]]])
     path = write_obj(tmp_path / "fins.obj", cube_mesh().vertices, fins.tolist())
-    with pytest.raises(ValueError, match=r"fins.obj: \d edges are shared by more than two"):
+    with pytest.raises(ValueError, match=r"fins.obj: the edge from .* is shared by \d triangles"):
         read(path)
     path = tmp_path / "tetra.vtu"
     meshio.write(path, meshio.Mesh(np.eye(4, 3), [("tetra", [[0, 1, 2, 3]])]))
@@ -367,8 +367,8 @@ def test_a_list_of_points_is_not_resampled(tmp_path):
 @pytest.mark.parametrize(
     ("name", "fields", "message"),
     [
-        ("a.vtu", {"u": np.zeros(49)}, r"field 'u' has shape \(49,\), expected \(50, ...\)"),
-        ("a.vtu", {"u": np.zeros((50, 2, 3))}, r"tensor 'u' has shape \(50, 2, 3\)"),
+        ("a.vtu", {"u": np.zeros(49)}, r"field 'u' has shape \(49,\), expected \(50,\)"),
+        ("a.vtu", {"u": np.zeros((50, 2, 3))}, r"field 'u' has shape \(50, 2, 3\)"),
         ("a.vtu", {"u": np.zeros(50, complex)}, "field 'u' holds complex128"),
         ("a.vtu", {"normals": np.zeros((50, 3))}, "the name 'normals' is taken"),
         ("a.ply", {"x": np.zeros(50)}, "the name 'x' is taken"),

@@ -138,10 +138,10 @@ CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1]])
         ([[0, 1, 2], [1, 1, 3]], "triangle 1 names a vertex twice"),
         (
             [[0, 1, 2], [1, 0, 3], [0, 1, 4]],
-            r"1 edges are shared by more than two triangles \(first: vertices 0 and 1, 3",
+            "edge from vertex 0 to 1 is shared by 3 triangles, expected at most 2",
         ),
         ([[0, 1, 2], [1, 2, 3]], "triangles 0 and 1 have opposite orientation"),
-        ([[0, 1]], r"triangles must have shape \(m, 3\), not \(1, 2\)"),
+        ([[0, 1]], r"triangles have shape \(1, 2\), expected \(m, 3\)"),
     ],
 )
 def test_bad_triangles(triangles, message):
@@ -152,7 +152,7 @@ def test_bad_triangles(triangles, message):
 def test_bad_vertices():
     with pytest.raises(ValueError, match="vertex 2 is not finite"):
         TriangleMesh(np.where(np.eye(5, 3) * [0, 0, 1] > 0, np.nan, CORNERS), [[0, 1, 3]])
-    with pytest.raises(ValueError, match=r"vertices must have shape \(n, 3\), not \(5, 2\)"):
+    with pytest.raises(ValueError, match=r"vertices have shape \(5, 2\), expected \(n, 3\)"):
         TriangleMesh(CORNERS[:, :2], [[0, 1, 3]])
 
 

@@ -278,5 +278,5 @@ def test_a_moved_cloud_is_as_stable_as_a_new_one(degree):
 
 def test_the_search_is_made_on_the_host():
     surface = js.discretize(js.sphere(300), method=METHOD)
-    with pytest.raises(ValueError, match="search needs a concrete surface"):
+    with pytest.raises(ValueError, match="the surface must be concrete"):
         eqx.filter_jit(lambda s: s.search())(surface)

@@ -68,7 +68,7 @@ def test_sort_cloud_carries_fields_in_and_out_and_keeps_inactive_rows_last():
 def test_sort_refuses_what_it_cannot_sort():
     with pytest.raises(ValueError, match="point 1 is not finite"):
         sort_points(np.array([[0.0, 0.0], [np.inf, 0.0]]))
-    with pytest.raises(ValueError, match=r"shape \(n, 2\) or \(n, 3\), not \(4, 5\)"):
+    with pytest.raises(ValueError, match=r"shape \(4, 5\), expected \(n, 2\) or \(n, 3\)"):
         sort_points(np.zeros((4, 5)))
     with pytest.raises(ValueError, match="concrete"):
         jax.jit(lambda p: sort_cloud(PointCloud(p, p))[0].points)(jnp.asarray(random_sphere(9)))

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import instance, is_concrete, raise_at
+from ..arguments import instance, shaped
 from ..cloud import PointCloud
+from ..failures import check, is_concrete
 from ..frames import tangent_frames
 
 
@@ -46,15 +47,12 @@ class Border(eqx.Module):
             raise ValueError(f"points has shape {m}, expected (m,) with at least 1 point")
         if len(shape) != 3 or shape[:2] != (2, *m) or shape[2] < 2:
             raise ValueError(f"rows has shape {shape}, expected (2, {m[0]}, r)")
-        if np.shape(self.mask) != shape:
-            raise ValueError(f"mask has shape {np.shape(self.mask)}, expected {shape}")
+        shaped(self.mask, "mask", shape)
         for name in ("points", "rows"):
             given = getattr(self, name)
             if given.dtype.kind not in "iu":
                 raise TypeError(f"{name} is of type {given.dtype}, expected indices")
-            if is_concrete(given):
-                values = np.asarray(given).ravel()
-                raise_at(values < 0, f"{name} names point {{v}}", values)
+            check(given, lambda x: x < 0, f"{name} names point {{v}}, points count from 0")
 
     def __repr__(self):
         _, m, r = self.rows.shape
@@ -153,8 +151,6 @@ def _lagrange(nodes, mask, x):
 def checked_border(border: Border, cloud: PointCloud) -> Border:
     """Refuse what is no border, or that of a larger cloud."""
     instance(border, Border, "border", "made by js.find_border")
-    if is_concrete(border.points):
-        last = int(np.asarray(border.points).max())
-        if last >= cloud.n:
-            raise ValueError(f"border names point {last}, the cloud has {cloud.n}")
+    text = f"border names point {{v}}, the cloud has {cloud.n}"
+    check(border.points, lambda x: x >= cloud.n, text)
     return border

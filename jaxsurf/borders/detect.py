@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Array, Bool
 from scipy.spatial import cKDTree
 
-from ..arguments import instance, is_concrete, real, whole
+from ..arguments import instance, real, whole
 from ..cloud import PointCloud
+from ..failures import needs_values
 from ..frames import tangent_frames
 from ..sheets import nearest
 
@@ -42,8 +43,7 @@ def detect_border(cloud: PointCloud, *, k: int = _RING, gap: float = _GAP) -> Bo
         True
     """
     instance(cloud, PointCloud, "cloud")
-    if not is_concrete(cloud.points, cloud.normals):
-        raise ValueError("detect_border needs a concrete cloud")
+    needs_values("cloud", cloud)
     whole(k, "k", least=3, most=cloud.n)
     real(gap, "gap", above=0, below=np.pi)
     on = cloud.host_active

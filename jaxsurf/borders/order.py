@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
-from ..arguments import instance, is_concrete, without_derivatives
+from ..arguments import instance
 from ..cloud import PointCloud
+from ..failures import needs_values, without_derivatives
 from ..shapes.meshes import TriangleMesh
 from ..sheets import distance_key
 from .border import Border, checked_border
@@ -81,8 +82,7 @@ def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
     """
     instance(cloud, PointCloud, "cloud")
     cloud = without_derivatives(cloud)
-    if not is_concrete(cloud.points, cloud.normals, cloud.boundary):
-        raise ValueError("find_border needs a concrete cloud; find it first and pass it on")
+    needs_values("cloud", cloud, instead="find the border outside jit and vmap, and pass it on")
     if mesh is not None:
         instance(mesh, TriangleMesh, "mesh")
         if len(mesh.vertices) != cloud.n:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from jaxsurf.arguments import raise_at
+from jaxsurf.failures import raise_at
 from jaxsurf.formats.contents import Contents, complete
 
 # Rows of three columns in text files are normals if they are this close to length one: what two

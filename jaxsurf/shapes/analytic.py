@@ -7,8 +7,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsurf.arguments import in_range, is_concrete, on_host, raise_at, real, whole
+from jaxsurf.arguments import in_range, on_host, real, whole
 from jaxsurf.cloud import PointCloud
+from jaxsurf.failures import needs_values, not_positive, raise_at
 from jaxsurf.shapes.parametric import (
     GOLDEN_ANGLE,
     check_count,
@@ -239,15 +240,12 @@ def _equal_area_ellipsoid(n: int, semi: np.ndarray) -> tuple[np.ndarray, float]:
 
 def _check_positive(name: str, value: Any) -> None:
     real(value, name, above=0)
-    if not is_concrete(value):
-        raise TypeError(f"{name} must be concrete: points are chosen outside jit and grad")
+    needs_values(name, value, instead="points are chosen outside jit and grad")
     in_range(value, name)
 
 
 def _checked_axes(axes: tuple[float, float, float]) -> np.ndarray:
-    semi = on_host(axes, "axes")
-    if semi.shape != (3,):
-        raise ValueError(f"axes must be three numbers, not shape {semi.shape}")
-    raise_at(~(np.isfinite(semi) & (semi > 0)), "axis {i} is {v}, expected a positive number", semi)
+    semi = on_host(axes, "axes", (3,))
+    raise_at(not_positive(semi), "axis {i} is {v}, expected a positive number", semi)
     in_range(semi, "axes")
     return semi

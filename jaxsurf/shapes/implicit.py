@@ -12,11 +12,11 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxsurf.arguments import as_float, differentiable, finite, is_concrete, raise_at, real, whole
+from jaxsurf.arguments import POINTS, as_float, differentiable, finite, real, whole
+from jaxsurf.failures import check, not_finite, not_positive
 from jaxsurf.functions import Traced, canonical
 
 LevelSet = Callable[[Float[Array, " d"]], Float[Array, ""]]
@@ -70,14 +70,13 @@ def project_to_level_set(
         limit = jnp.asarray(real(tolerance, "tolerance", above=0), points.dtype)
     program = program_of(phi, points[0] if len(points) else jnp.zeros(points.shape[1:]))
     found, step = _projected(program, points, limit, jnp.asarray(max_steps))
-    if throw and is_concrete(found, step):
-        step = np.abs(np.asarray(step))
-        raise_at(
-            ~(step <= np.asarray(limit)),
-            f"projection of point {{i}} did not converge: last step {{v}}, tolerance {limit:.2g}, "
-            f"{max_steps} steps (too far from the level set, or the gradient vanishes)",
-            step,
+    if throw:
+        text = (
+            "projection of point {i} did not converge: last step {v}, tolerance {limit:.2g}, "
+            f"{max_steps} steps (too far from the level set, or the gradient vanishes)"
         )
+        bad = lambda step, limit, found: ~(step <= limit)
+        check(step, bad, text, limit, found, limit=limit)
     return found
 
 
@@ -98,8 +97,8 @@ def _projected(phi: Traced, points, limit, max_steps):
             lambda _, guess: guess,
             lambda slope, y: y / slope(jnp.ones_like(y)),
         )
-        good = jnp.abs(step) <= limit
-        return jnp.where(good, start + t * g, jnp.nan), step
+        last = jnp.abs(step)
+        return jnp.where(last <= limit, start + t * g, jnp.nan), last
 
     return jax.vmap(single)(points)
 
@@ -124,10 +123,7 @@ def level_set_normals(phi: LevelSet, points: Float[Array, "n d"]) -> Float[Array
     """
     points = _checked_points(points)
     normals, length = _directions(program_of(phi, points), points)
-    if is_concrete(length):
-        size = np.asarray(length)
-        bad = ~(np.isfinite(size) & (size > 0))
-        raise_at(bad, "gradient of phi at point {i} has length {v}", size)
+    check(length, not_positive, "gradient of phi at point {i} has length {v}")
     return normals
 
 
@@ -161,10 +157,8 @@ def level_set_curvature(
 
     points = _checked_points(points)
     mean, gauss = _curvatures(program_of(phi, points), points)
-    if is_concrete(mean, gauss):
-        values = np.asarray(mean)
-        bad = ~(np.isfinite(values) & np.isfinite(np.asarray(gauss)))
-        raise_at(bad, "curvature at point {i} is {v}: the gradient of phi vanishes", values)
+    bad = lambda mean, gauss: not_finite(mean) | not_finite(gauss)
+    check(mean, bad, "curvature at point {i} is {v}: the gradient of phi vanishes", gauss)
     return mean, gauss
 
 
@@ -215,10 +209,7 @@ def program_of(phi: LevelSet, points) -> Traced:
 
 
 def _checked_points(points) -> Float[Array, "n d"]:
-    points = as_float(points, "points")
-    if points.ndim != 2 or points.shape[1] not in (2, 3):
-        raise ValueError(f"points must have shape (n, 2) or (n, 3), not {points.shape}")
-    return finite(points, "points")
+    return finite(as_float(points, "points", *POINTS), "points")
 
 
 @eqx.filter_jit

@@ -193,11 +193,7 @@ def _onto(look, start: np.ndarray, limit: float | None = None, *, most: float = 
 
 
 def _checked_bounds(bounds) -> np.ndarray:
-    box = on_host(bounds, "bounds")
-    if box.ndim != 2 or box.shape[0] != 2 or box.shape[1] not in (2, 3):
-        raise ValueError(
-            f"bounds must be two corners in 2 or 3 dimensions, shape (2, d), not {box.shape}"
-        )
+    box = on_host(bounds, "bounds", (2, 2), (2, 3))
     if not (np.isfinite(box).all() and (box[1] > box[0]).all()):
         raise ValueError(f"upper corner {box[1]} must exceed lower corner {box[0]} on every axis")
     return in_range(box, "bounds")

@@ -11,7 +11,8 @@ from numpy import ndarray as Array
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from jaxsurf.arguments import in_range, on_host, raise_at
+from jaxsurf.arguments import in_range, on_host, shaped
+from jaxsurf.failures import not_finite, raise_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,14 +48,14 @@ class TriangleMesh:
         t = self.triangles
         twice = (t[:, 0] == t[:, 1]) | (t[:, 1] == t[:, 2]) | (t[:, 2] == t[:, 0])
         raise_at(twice, "triangle {i} names a vertex twice: {v}", t)
-        check_manifold(self.edge_table)
-        turned = np.flatnonzero((self.edge_table.faces[:, 1] >= 0) & ~self.edge_table.consistent)
-        if turned.size:
-            a, b = self.edge_table.faces[turned[0]]
-            raise ValueError(
-                f"triangles {a} and {b} have opposite orientation across their common edge"
-                f" ({turned.size} such edges); clean_mesh turns them round"
-            )
+        table = self.edge_table
+        check_manifold(table)
+        raise_at(
+            (table.faces[:, 1] >= 0) & ~table.consistent,
+            "triangles {v[0]} and {v[1]} have opposite orientation across their common edge{more}; "
+            "clean_mesh turns them round",
+            table.faces,
+        )
 
     def __repr__(self) -> str:
         kind = "closed" if self.closed else f"{len(self.border_loops)} borders"
@@ -216,11 +217,9 @@ def vertex_numbers(triangles) -> Int[Array, "..."]:
 
 
 def check_arrays(vertices, triangles):
-    if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise ValueError(f"vertices must have shape (n, 3), not {vertices.shape}")
-    if triangles.ndim != 2 or triangles.shape[1] != 3:
-        raise ValueError(f"triangles must have shape (m, 3), not {triangles.shape}")
-    raise_at(~np.isfinite(vertices).all(axis=1), "vertex {i} is not finite: {v}", vertices)
+    shaped(vertices, "vertices", ("n", 3))
+    shaped(triangles, "triangles", ("m", 3))
+    raise_at(not_finite(vertices), "vertex {i} is not finite: {v}", vertices)
     in_range(vertices, "vertices")
     outside = ((triangles < 0) | (triangles >= len(vertices))).any(axis=1)
     text = f"triangle {{i}} names the vertices {{v}} (from 0), but there are {len(vertices)}"
@@ -228,14 +227,14 @@ def check_arrays(vertices, triangles):
 
 
 def check_manifold(table: EdgeTable):
-    many = np.flatnonzero(table.count > 2)
-    if many.size:
-        i, j = table.ends[many[0]]
-        raise ValueError(
-            f"{many.size} edges are shared by more than two triangles (first: vertices {i} and"
-            f" {j}, {table.count[many[0]]} triangles); largest_part=True of clean_mesh and read"
-            " drops what stands on the largest part, faces=False of read takes the points alone"
-        )
+    raise_at(
+        table.count > 2,
+        "the edge from vertex {v[0]} to {v[1]} is shared by {count} triangles, expected at most 2"
+        "{more}; largest_part=True of clean_mesh and read drops what stands on the largest part, "
+        "faces=False of read takes the points alone",
+        table.ends,
+        count=table.count,
+    )
 
 
 def graph_of(links: Int[Array, "e 2"], n: int) -> sparse.coo_array:

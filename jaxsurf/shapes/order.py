@@ -5,8 +5,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsurf.arguments import instance, is_concrete, on_host, raise_at
+from jaxsurf.arguments import POINTS, instance, on_host
 from jaxsurf.cloud import PointCloud
+from jaxsurf.failures import needs_values, not_finite, raise_at
 
 # 16 bits an axis tell 65,536 steps along the longest side apart: finer than any surface cloud
 # that fits in memory, and a key of at most 48 bits.
@@ -35,12 +36,9 @@ def sort_points(points) -> np.ndarray:
         >>> sorted(order.tolist())
         [0, 1, 2, 3]
     """
-    if not is_concrete(points):
-        raise ValueError("sorting needs concrete points: sort before entering jit or grad")
-    points = on_host(points, "points")
-    if points.ndim != 2 or points.shape[1] not in (2, 3):
-        raise ValueError(f"points must have shape (n, 2) or (n, 3), not {points.shape}")
-    raise_at(~np.isfinite(points).all(axis=1), "point {i} is not finite: {v}", points)
+    needs_values("points", points, instead="sort before entering jit or grad")
+    points = on_host(points, "points", *POINTS)
+    raise_at(not_finite(points), "point {i} is not finite: {v}", points)
     if len(points) < 2:
         return np.arange(len(points))
     lower = points.min(axis=0)
@@ -76,8 +74,7 @@ def sort_cloud(cloud: PointCloud) -> tuple[PointCloud, np.ndarray]:
         [10.0, 20.0, 30.0]
     """
     instance(cloud, PointCloud, "cloud", "js.PointCloud(points, normals) makes one")
-    if not is_concrete(cloud.points, cloud.active):
-        raise ValueError("sorting needs a concrete cloud: sort before entering jit or grad")
+    needs_values("cloud", cloud, instead="sort before entering jit or grad")
     on = cloud.host_active
     rows = np.flatnonzero(on)
     order = np.concatenate([rows[sort_points(np.asarray(cloud.points)[rows])], np.flatnonzero(~on)])

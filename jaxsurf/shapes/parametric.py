@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsurf.arguments import differentiable, in_range, on_host, raise_at, whole
+from jaxsurf.arguments import differentiable, in_range, on_host, whole
 from jaxsurf.cloud import PointCloud
 from jaxsurf.compiling import block_by_block
+from jaxsurf.failures import raise_at
 from jaxsurf.functions import Traced, canonical
 from jaxsurf.shapes.order import sort_points
 from jaxsurf.shapes.spacing import MOST

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
-from jaxsurf.arguments import instance, on_host, raise_at, real, whole
+from jaxsurf.arguments import instance, on_host, real, whole
 from jaxsurf.cloud import PointCloud
+from jaxsurf.failures import not_finite, raise_at
 from jaxsurf.shapes.spacing import ideal_spacing, same_sheet
 from jaxsurf.shapes.thinning import DISK, checked_like, checked_points, thin
 
@@ -232,6 +233,6 @@ def _projected(points: np.ndarray, project: Project) -> tuple[np.ndarray, np.nda
         raise TypeError("project must return a pair: points and unit normals")
     onto = checked_like(result[0], points, "the points that project returns")
     normals = checked_like(result[1], points, "the normals that project returns")
-    finite = np.isfinite(onto).all(axis=1) & np.isfinite(normals).all(axis=1)
-    raise_at(~finite, "projection failed for point {i} at {v}", points)
+    bad = not_finite(onto) | not_finite(normals)
+    raise_at(bad, "projection failed for point {i} at {v}", points)
     return onto, normals

@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from jaxsurf.arguments import in_range, on_host, raise_at, real, whole
+from jaxsurf.arguments import POINTS, in_range, on_host, real, whole
 from jaxsurf.compiling import AnyArray
+from jaxsurf.failures import not_finite, raise_at
 from jaxsurf.shapes.spacing import same_sheet
 
 # A maximal Poisson-disk subset of about six random candidates a point, no two closer than this
@@ -114,18 +115,13 @@ def thin(
 
 
 def checked_points(values, name: str) -> np.ndarray:
-    points = on_host(values, name)
-    if points.ndim != 2 or points.shape[1] not in (2, 3):
-        raise ValueError(f"{name} must have shape (m, 2) or (m, 3), not {points.shape}")
-    raise_at(~np.isfinite(points).all(axis=1), f"{name}: point {{i}} is not finite: {{v}}", points)
+    points = on_host(values, name, *POINTS)
+    raise_at(not_finite(points), f"{name}: point {{i}} is not finite: {{v}}", points)
     return in_range(points, name)
 
 
 def checked_like(values, points: np.ndarray, name: str) -> np.ndarray:
-    array = on_host(values, name)
-    if array.shape != points.shape:
-        raise ValueError(f"{name} have shape {array.shape}, expected {points.shape}")
-    return array
+    return on_host(values, name, points.shape)
 
 
 def _candidate_spacing(candidates: np.ndarray) -> float:

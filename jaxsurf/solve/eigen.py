@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import count_on, instance, is_concrete, real, switched_off, whole
+from ..arguments import count_on, instance, real, switched_off, whole
 from ..boundary import Closure, check_border
+from ..failures import is_concrete
 from ..stencils.algebra import AbstractOperator, check_scalar
 from . import invariant
 from .invariant import Subspace
@@ -293,7 +294,7 @@ def _on_host(function, shapes, *arguments):
         arrays = jax.tree.map(np.asarray, arrays)
         return function(*eqx.combine(arrays, rest))
 
-    if is_concrete(*jax.tree.leaves(arrays)):
+    if is_concrete(arrays):
         found = call(arrays)
         return jax.tree.map(lambda a, shape: jnp.asarray(a, shape.dtype), found, shapes)
     return jax.pure_callback(call, shapes, arrays, vmap_method="sequential")

@@ -13,11 +13,12 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import instance, is_concrete, real
+from ..arguments import instance, real
 from ..build import choose_neighbors
 from ..cloud import PointCloud
 from ..compiling import at_once, sized_jit
 from ..discretization import Discretization
+from ..failures import is_concrete, needs_values, refuse
 from ..neighbors import Neighbors, find_neighbors, switched_on
 from ..stencils.gfdm import GFDM
 from ..stencils.lineax import Action
@@ -99,8 +100,8 @@ def geodesic_distance(
     sources = source_indices(sources, cloud)  # type: ignore[assignment]
     if neighbors is None:
         neighbors = _neighbors(cloud, method)
-    elif not is_concrete(neighbors.indices, neighbors.mask):
-        raise ValueError("neighbours must be concrete arrays")
+    else:
+        needs_values("neighbors", neighbors.indices, neighbors.mask)
     if cloud.active is not None:
         cloud, neighbors = cloud.seen, _own_in_padding(switched_on(cloud, neighbors))
     if rtol is not None:
@@ -214,7 +215,7 @@ def _relaxed(operator: Callable, rhs, diagonal, size: Callable, rtol: float):
     start = rhs / diagonal, jnp.array(True), jnp.array(0)
     goes_on = lambda carry: carry[1] & (carry[2] < limit)
     x, unfinished, _ = jax.lax.while_loop(goes_on, step, start)
-    return eqx.error_if(
+    return refuse(
         x,
         unfinished,
         f"heat from the sources has not converged in {limit} steps of Jacobi's iteration, which "
@@ -267,7 +268,7 @@ def _integrate(x, normals, indices, share, direction, fixed, value, inverse, rto
     matrix = Action(operator, rhs.dtype)
     rhs = jnp.where(fixed, 0, rhs)
     found = lx.linear_solve(matrix, rhs, BiCGStab(rtol), options=options, throw=False)
-    free = eqx.error_if(
+    free = refuse(
         found.value,
         found.result != lx.RESULTS.successful,
         f"distances have not been found to a relative tolerance of {rtol:.1g} (`rtol`)",

@@ -10,6 +10,7 @@ import scipy.sparse
 from jaxtyping import Complex, Float, Int
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs, gmres
 
+from ..failures import raise_at
 from .inverse import Inverse
 
 # Up to this size all eigenvalues of the full matrix are computed.
@@ -65,9 +66,8 @@ def subspace(
         left: whether left vectors are needed.
     """
     n, count = reference.shape
-    if not np.isfinite(matrix.data).all():
-        row = int(np.argmax(np.bincount(matrix.tocoo().row, ~np.isfinite(matrix.data)) > 0))
-        raise ValueError(f"row {row} of the operator is not finite")
+    bad = ~np.isfinite(matrix.data)
+    raise_at(bad, "row {i} of the operator is not finite", points=matrix.tocoo().row)
     inverse = Inverse(matrix, shift=-_scale(matrix))
     eigenvalues, vectors = _lowest(matrix, count, inverse)
     groups = _groups(eigenvalues, degenerate, inverse.shift)

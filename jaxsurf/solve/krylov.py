@@ -12,7 +12,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ..arguments import is_concrete, real, whole
+from ..arguments import real, whole
+from ..failures import is_concrete
 
 _Results = lx.RESULTS
 

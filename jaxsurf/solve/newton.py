@@ -13,9 +13,10 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ..arguments import as_float, is_concrete, switched_off, whole
+from ..arguments import as_float, finite, switched_off, whole
 from ..boundary import Closure
 from ..compiling import sized_jit
+from ..failures import is_concrete, refuse
 from ..functions import canonical, numbers_as_arrays
 from ..stencils.algebra import AbstractOperator, Map
 from ..stencils.lineax import Action
@@ -97,13 +98,10 @@ def solve_nonlinear(
     if not callable(reaction):
         raise TypeError(f"reaction is a {type(reaction).__name__}, expected a function (u, args)")
     whole(max_steps, "max_steps", least=1)
-    u0, rhs = as_float(u0, "u0"), as_float(rhs, "right-hand side")
+    u0 = as_float(u0, "u0", (operator.n,))
+    rhs = as_float(rhs, "right-hand side", (), u0.shape)
     u0 = u0.astype(jnp.result_type(u0, *jax.tree.leaves(operator), jnp.float32))
     rhs, rtol = rhs.astype(u0.dtype), tolerance(rtol, u0.dtype)
-    if u0.shape != (operator.n,) or rhs.shape not in ((), u0.shape):
-        raise ValueError(
-            f"u0 has shape {u0.shape} and the right-hand side {rhs.shape}, expected ({operator.n},)"
-        )
     u0 = switched_off(operator.active, u0)
     if rhs.ndim:
         rhs = switched_off(operator.active, rhs)
@@ -111,10 +109,8 @@ def solve_nonlinear(
     if getattr(given, "shape", None) != u0.shape:
         shape = getattr(given, "shape", type(given).__name__)
         raise ValueError(f"reaction returns {shape}, expected an array of shape {u0.shape}")
-    if is_concrete(u0, rhs) and not (np.isfinite(u0).all() and np.isfinite(rhs).all()):
-        name, values = ("u0", u0) if not np.isfinite(u0).all() else ("right-hand side", rhs)
-        i = int(np.argmin(np.isfinite(np.ravel(values))))
-        raise ValueError(f"{name} is not finite at point {i}")
+    finite(u0, "u0")
+    finite(rhs, "right-hand side")
     # Programs and arrays: other numbers, or the same code in a new lambda, compile nothing.
     args = numbers_as_arrays(args)
     reaction = canonical(reaction, u0, args)
@@ -126,7 +122,7 @@ def solve_nonlinear(
             "singular at u0: the operator annihilates the constants and the reaction has slope "
             "zero. Start elsewhere, or solve a linear problem with js.solve"
         )
-    concrete = is_concrete(*jax.tree.leaves((problem, u0, preconditioner)))
+    concrete = is_concrete(problem, u0, preconditioner)
     if not concrete:  # nothing concrete is differentiated
         problem = eqx.tree_at(lambda p: p.operator, problem, prepared(operator))
     numbers = np.asarray(rtol), np.asarray(float(atol)), np.asarray(max_steps)
@@ -241,12 +237,11 @@ def _solve(problem, u0, preconditioner, solver, rtol, atol, max_steps, concrete,
         v = v + last - jax.lax.stop_gradient(last)
     u = problem.field(v)
     if throw:
-        u = eqx.error_if(
-            u,
-            result != optx.RESULTS.successful,
+        text = (
             "js.solve_nonlinear did not reach its tolerance within max_steps; with throw=False, "
-            "`result` says why and `stats` what was reached",
+            "`result` says why and `stats` what was reached"
         )
+        u = refuse(u, result != optx.RESULTS.successful, text)
     stats = {
         "num_steps": state.steps,
         "num_linear_steps": state.linear,

@@ -10,15 +10,15 @@ from jaxtyping import Array, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from ..arguments import is_concrete, raise_at, switched_off
+from ..arguments import switched_off
 from ..cloud import PointCloud
+from ..failures import is_concrete, needs_values, raise_at
 
 
 def source_indices(sources, cloud: PointCloud) -> Int[np.ndarray, " m"]:
     """Sources given as a mask or as indices, as sorted indices; else an error."""
     n = cloud.n
-    if not is_concrete(sources):
-        raise ValueError("sources must be concrete arrays")
+    needs_values("sources", sources)
     sources = np.asarray(sources)
     if sources.dtype == bool:
         if sources.shape != (n,):
@@ -36,8 +36,7 @@ def source_indices(sources, cloud: PointCloud) -> Int[np.ndarray, " m"]:
         wrong = sources[0] if sources[0] < 0 else sources[-1]
         raise ValueError(f"source {wrong} is not among the points 0 to {n - 1}")
     if cloud.active is not None:
-        if not is_concrete(cloud.active):
-            raise ValueError("cloud.active must be concrete: it decides which points paths lead to")
+        needs_values("cloud.active, which decides where paths lead to,", cloud.active)
         raise_at(~cloud.host_active[sources], "source {v} is switched off", sources)
     return sources
 
@@ -55,12 +54,7 @@ def path_lengths(points, neighbors, indices, mask, sources, off) -> Float[Array,
     links = csr_array((length, (column, row)), shape=(len(indices), len(indices)))
     path = dijkstra(links, indices=sources, min_only=True)
     path[off] = 0
-    lost = np.flatnonzero(~np.isfinite(path))
-    if lost.size:
-        raise ValueError(
-            f"no path along neighbours leads from the sources to point {lost[0]} "
-            f"({lost.size} such points)"
-        )
+    raise_at(~np.isfinite(path), "no path along neighbours leads from the sources to point {i}")
     if concrete:
         return jax.device_put(path.astype(points.dtype))
     return switched_off(~off, _relaxed(points, neighbors, sources))

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
-from ..arguments import is_concrete, without_derivatives
+from ..failures import is_concrete, without_derivatives
 
 # Row sums up to this many times round-off are those of an operator that annihilates constants.
 _ROUNDOFF = 32

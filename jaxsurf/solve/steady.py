@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..arguments import as_float, count_on, is_concrete, switched_off, whole, without_derivatives
+from ..arguments import as_float, count_on, finite, switched_off, whole
 from ..boundary import Closure
 from ..compiling import sized_jit
+from ..failures import is_concrete, needs_values, refuse, without_derivatives
 from ..stencils.algebra import AbstractOperator
 from ..stencils.lineax import Action
 from ..stencils.stencil import prepared
@@ -103,15 +103,14 @@ def solve(
         True
     """
     check_system(operator, conditions, preconditioner, solver, atol)
-    rhs = as_float(rhs, "right-hand side")
+    rhs = as_float(rhs, "right-hand side", (operator.n,), (operator.n, "c"))
     rhs = rhs.astype(jnp.result_type(rhs, *jax.tree.leaves(operator), jnp.float32))
-    if rhs.shape[:1] == (operator.n,):
-        rhs = switched_off(operator.active, rhs)
+    rhs = switched_off(operator.active, rhs)
     _check(operator, rhs, conditions)
     # What was not asked for may end at round-off.
     given, rtol = rtol is not None, tolerance(rtol, rhs.dtype)
     whole(max_steps, "max_steps", least=1)
-    concrete = is_concrete(*jax.tree.leaves((operator, rhs, conditions, preconditioner)))
+    concrete = is_concrete(operator, rhs, conditions, preconditioner)
     if preconditioner is None:
         preconditioner = multigrid(operator, conditions=conditions)
     if mean_zero is None:
@@ -178,13 +177,12 @@ def _solve_one(rhs, operator, conditions, preconditioner, solver, limits, mean_z
     result = lx.RESULTS.where(torn, lx.RESULTS.singular, result)
     result = lx.RESULTS.where(jnp.all(jnp.isfinite(known)), result, lx.RESULTS.nonfinite_input)
     if throw:
-        u = eqx.error_if(
-            u,
-            result != lx.RESULTS.successful,
+        text = (
             "js.solve did not reach its tolerance, or was given values that are not finite, or a "
             "right-hand side that is incompatible (see `project`); with throw=False, `result` says "
-            "why and `stats` what was reached",
+            "why and `stats` what was reached"
         )
+        u = refuse(u, result != lx.RESULTS.successful, text)
     size = jnp.where(size > 0, size, 1)
     stats = {
         "num_steps": found.stats.get("num_steps"),
@@ -204,30 +202,24 @@ def _is_mean_zero(operator, conditions, preconditioner) -> bool:
     if preconditioner.mean_zero is not None:
         return preconditioner.mean_zero
     known = without_derivatives((operator, conditions))
-    if not is_concrete(*jax.tree.leaves(known)):
-        raise ValueError(
-            "whether the operator annihilates the constants is not to be seen on traced arrays: "
-            "pass mean_zero=True or False, or a preconditioner made outside by js.multigrid"
-        )
+    needs_values(
+        "operator and conditions",
+        known,
+        instead="pass mean_zero=True or False, or a preconditioner made outside jit and vmap",
+    )
     free = free_points(operator, conditions)
     return annihilates_constants(reduced_matrix(operator, conditions), free)
 
 
 def _check(operator, rhs, conditions) -> None:
-    if rhs.ndim not in (1, 2) or rhs.shape[0] != operator.n:
-        n = operator.n
-        raise ValueError(f"right-hand side has shape {rhs.shape}, expected ({n},) or ({n}, c)")
     if rhs.ndim == 2 and not rhs.shape[1]:
         raise ValueError(
             f"right-hand side has shape {rhs.shape}: no column, one at least is needed"
         )
-    if not is_concrete(*jax.tree.leaves((rhs, conditions))):
-        return
-    values = np.asarray(rhs if conditions is None else conditions(rhs))
-    bad = np.flatnonzero(~np.isfinite(values).reshape(operator.n, -1).all(axis=1))
-    if bad.size:
-        what = "right-hand side or condition" if conditions is not None else "right-hand side"
-        raise ValueError(f"{what} is not finite at point {bad[0]} ({bad.size} such points)")
+    if conditions is None:
+        finite(rhs, "right-hand side")
+    elif is_concrete(rhs, conditions):
+        finite(conditions(rhs), "right-hand side or condition")
 
 
 def _raise_on_failure(solution, dtype, rtol, atol) -> None:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float
 
-from ..arguments import instance, real
+from ..arguments import as_many, instance, real
 from ..boundary import Closure, Restriction, check_border
 from ..stencils.algebra import AbstractOperator, Composition, check_scalar
 from ..stencils.stencil import Stencil
@@ -138,8 +138,7 @@ def check_system(operator, conditions, preconditioner, solver, atol) -> None:
     if conditions is not None:
         hint = "js.close(cloud, conditions) makes one of conditions"
         instance(conditions, Closure, "conditions", hint)
-        if conditions.n != operator.n:
-            raise ValueError(f"conditions for {conditions.n} points, the operator has {operator.n}")
+        as_many("conditions", conditions.n, "the operator", operator.n)
     if preconditioner is not None:
         hint = "js.multigrid(operator) makes one"
         instance(preconditioner, AbstractPreconditioner, "preconditioner", hint)

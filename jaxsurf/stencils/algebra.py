@@ -145,15 +145,7 @@ class AbstractOperator(eqx.Module):
 
     def checked(self, u: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
         """A field that the operator takes, as an array; else an error."""
-        u = as_float(u, "field")
-        split = u.ndim - len(self.in_shape)
-        if split < 1 or u.shape[0] != self.n or u.shape[split:] != self.in_shape:
-            batch = "".join(f", {c}" for c in self.in_shape)
-            raise ValueError(
-                f"field has shape {u.shape}, expected ({self.n}{batch or ','}) or a batch "
-                f"({self.n}, c{batch})"
-            )
-        return u
+        return as_float(u, "field", (self.n, ..., *self.in_shape))
 
     @property
     def _maps(self) -> str:
@@ -394,7 +386,4 @@ def check_scalar(operator: AbstractOperator) -> None:
 
 def per_point(value: ArrayLike, n: int, name: str) -> Float[Array, "*n"]:
     """A number or one number per point, as an array; else an error."""
-    value = as_float(value, name)
-    if value.shape not in ((), (n,)):
-        raise ValueError(f"{name} has shape {value.shape}, expected () or ({n},)")
-    return value
+    return as_float(value, name, (), (n,))

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from ..arguments import is_concrete
+from ..failures import is_concrete
 
 
 def either(one, other):

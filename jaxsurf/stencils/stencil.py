@@ -15,7 +15,8 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import is_array, is_concrete, mask, point_indices, raise_at, switched_off
+from ..arguments import is_array, mask, point_indices, shaped, switched_off
+from ..failures import check, is_concrete
 from .algebra import AbstractOperator, Transposed, per_point
 from .gathers import product
 from .masks import both, either
@@ -72,13 +73,11 @@ class Stencil(AbstractOperator):
         if is_array(weights):
             if not jnp.issubdtype(weights.dtype, jnp.floating):
                 raise TypeError(f"weights are {weights.dtype}, expected floating-point numbers")
-            shape = (self.k, *self.out_shape, *self.in_shape, self.n)
-            if weights.shape != shape:
-                raise ValueError(f"weights have shape {weights.shape}, expected {shape}")
-            if self.diagnostics is None and is_concrete(weights):
+            shaped(weights, "weights", (self.k, *self.out_shape, *self.in_shape, self.n))
+            if self.diagnostics is None:
                 # Those with diagnostics were looked at when they were built, or were not to be.
-                bad = ~np.isfinite(np.asarray(weights)).reshape(-1, self.n).all(axis=0)
-                raise_at(bad, "weights of point {i} are not finite", np.asarray(bad))
+                bad = lambda w: ~np.isfinite(w).reshape(-1, self.n).all(axis=0)
+                check(weights, bad, "weights of point {i} are not finite")
         for name in ("border", "active"):
             if is_array(getattr(self, name)):
                 mask(getattr(self, name), self.n, name)

@@ -81,7 +81,7 @@ ESTIMATES = [
         "estimate_normals",
         "traced points",
         lambda: jax.jit(js.estimate_normals)(unit()),
-        ("estimate_normals", "refit_normals"),
+        ("points", "concrete", "refit_normals"),
     ),
     Case(
         "from_points",

@@ -173,7 +173,7 @@ STENCIL = [
     ("a complex factor", lambda: 1j * ring(), ("factor", "complex", "real")),
     ("a term of another length", lambda: ring() + jnp.ones(5), ("term", "(5,)", f"({N},)")),
     ("a term in words", lambda: ring() + "1", ("term", "'1'", "real")),
-    ("composed with a number", lambda: ring() @ 3, ("field", "()", f"({N},)")),
+    ("composed with a number", lambda: ring() @ 3, ("field", "()", f"({N}, ...)")),
     ("composed with another size", lambda: ring() @ js.Stencil(jnp.zeros((1, 4), int), jnp.ones((1, 4))), ("(4, ())", f"({N}, ())")),
     ("load: a truncated file", lambda: load(file_bytes()[:-100]), ("a.npz", "does not hold a stencil")),
     ("load: half a file", lambda: load(file_bytes()[: len(file_bytes()) // 2]), ("a.npz", "does not hold a stencil")),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 from jaxtyping import Array, Bool, Float
 
 from ..compiling import AnyArray, namespace
@@ -61,7 +62,9 @@ class TangentPlane(eqx.Module):
         radius = around.support(around.offsets.shape[1] - 1, support)
         unit = radius * (_width(degree) if width is None else width)
         weights = gaussian(around.squared, unit, radius, around.mask)
-        return cls.at(around.normals[0], around.offsets, weights, unit, radius)
+        plane = cls.at(around.normals[0], around.offsets, weights, unit, radius)
+        # Without the barrier the compiler finds exponentials again for every use of them.
+        return jax.lax.optimization_barrier(plane)
 
     @classmethod
     def at(cls, normal, offsets, weights, width, radius) -> TangentPlane:

@@ -150,7 +150,7 @@ def neighborhood(block) -> Neighborhood:
     """What the stencils of one of these blocks see."""
     points, normals, mask, radius = block
     # The point itself stands in slot 0.
-    offsets = jnp.stack([x - x[0] for x in points], axis=1)
+    offsets = jax.lax.optimization_barrier(jnp.stack([x - x[0] for x in points], axis=1))
     return Neighborhood(offsets, jnp.stack(normals, axis=1), mask, radius)
 
 

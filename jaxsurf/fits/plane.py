@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..compiling import AnyArray, namespace
@@ -61,7 +63,9 @@ class TangentPlane(eqx.Module):
         radius = around.support(around.offsets.shape[1] - 1, support)
         unit = radius * (_width(degree) if width is None else width)
         weights = gaussian(around.squared, unit, radius, around.mask)
-        return cls.at(around.normals[0], around.offsets, weights, unit, radius)
+        plane = cls.at(around.normals[0], around.offsets, weights, unit, radius)
+        # Without the barrier the compiler finds exponentials again for every use of them.
+        return jax.lax.optimization_barrier(plane)
 
     @classmethod
     def at(cls, normal, offsets, weights, width, radius) -> TangentPlane:
@@ -91,4 +95,12 @@ def _width(degree: int) -> float:
 
 def dot(a: Float[AnyArray, "k d *p"], b: Float[AnyArray, "#k d *p"]) -> Float[AnyArray, "k *p"]:
     """Scalar products; written out, as sums over an axis between others are slow."""
-    return sum((a[:, i] * b[:, i] for i in range(1, a.shape[1])), a[:, 0] * b[:, 0])
+    first, *more = (x * y for x, y in zip(_along_axes(a), _along_axes(b)))
+    return sum(more, first)
+
+
+def _along_axes(a):
+    if namespace(a) is np:
+        return a.swapaxes(0, 1)
+    # As slices each would have a derivative as large as all of them.
+    return [x[:, 0] for x in jax.lax.split(a, (1,) * a.shape[1], axis=1)]

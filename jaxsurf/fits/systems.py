@@ -118,11 +118,17 @@ def _by_columns(a, shift):
         y = jax.lax.fori_loop(0, m, forward, jnp.zeros_like(b))
         return jax.lax.fori_loop(0, m, backward, jnp.zeros_like(b))
 
-    def solve(b, refined):
-        def refine(_, x):
-            return x + substitute(b - jnp.sum(a[:, :, None] * x[:, None], axis=0))
+    def times(x):
+        return jnp.sum(a[:, :, None] * x[:, None], axis=0)
 
-        return jax.lax.fori_loop(0, 2, refine, jnp.zeros_like(b)) if refined else substitute(b)
+    def solution(_, b):
+        refine = lambda _, x: x + substitute(b - times(x))
+        return jax.lax.fori_loop(0, 2, refine, jnp.zeros_like(b))
+
+    def solve(b, refined):
+        if not refined:
+            return substitute(b)
+        return jax.lax.custom_linear_solve(times, b, solution, symmetric=True)
 
     return solve, pivot
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -225,8 +226,8 @@ class Multigrid(AbstractPreconditioner):
 class _Product(AbstractPreconditioner):
     """One preconditioner after another, for a composition of operators."""
 
-    outer: AbstractPreconditioner
-    inner: AbstractPreconditioner
+    outer: Any
+    inner: Any
 
     @classmethod
     def of(cls, outer, inner):
@@ -245,8 +246,8 @@ class _Product(AbstractPreconditioner):
 
     def renewed(self, operator, *, conditions=None):
         instance(operator, Composition, "operator", "as the hierarchy was made for")
-        outer = self.outer.renewed(operator.outer, conditions=conditions)
-        return _Product.of(outer, self.inner.renewed(operator.inner, conditions=conditions))
+        pairs = (self.outer, operator.outer), (self.inner, operator.inner)
+        return _Product.of(*(p.renewed(o, conditions=conditions) for p, o in pairs))
 
 
 def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> Jacobi:
@@ -346,8 +347,9 @@ def _hierarchy(operator, conditions, single: bool, renewable: bool) -> Multigrid
         raise ValueError(f"coarsening stopped at {size} unknowns: too few strong connections")
     dense = np.zeros((room, room), fine.dtype)
     dense[:size, :size] = fine.toarray()
-    constant = np.append(constant, np.zeros(room - size)) if mean_zero else None
-    coarsest = dense_inverse(dense, np.arange(room) < size, constant).astype(dtype)
+    constant = np.append(constant, np.zeros(room - size))
+    used = np.arange(room) < size
+    coarsest = dense_inverse(dense, used, constant if mean_zero else None).astype(dtype)
     plan = plan_of(made, [(v.matrix, v.turned) for v in levels]) if renewable else None
     return Multigrid(mean_zero, tuple(levels), jnp.asarray(coarsest), plan)
 

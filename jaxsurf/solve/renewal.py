@@ -114,7 +114,7 @@ class Coarsening(eqx.Module):
     coarse: Pattern
 
     @classmethod
-    def of(cls, tentative, prolong, coarse, level, below) -> Coarsening:
+    def of(cls, tentative, prolong, coarse, level, below=None) -> Coarsening:
         """From what was set up on the host.
 
         Args:
@@ -129,8 +129,28 @@ class Coarsening(eqx.Module):
         dense = Pattern.dense(room) if below is None else Pattern.of(coarse, *below)
         return cls(jnp.asarray(aggregate), pattern, dense)
 
+    def transfers(self, A, inverse, radius, constant) -> tuple[Any, Any, Float[Array, " m"]]:
+        """Prolongation, its transpose and the constant on the next level, of a matrix."""
+        # Columns of the tentative prolongation have norm one.
+        zero = jnp.zeros(len(self.prolong.color), constant.dtype)
+        coarse = jnp.sqrt(zero.at[self.aggregate].add(constant**2, mode="drop"))
+        known = lambda x: x.at[self.aggregate].get(mode="fill", fill_value=0)
+        share = (constant * known(inverted(coarse)))[:, None]
+        step = damped_step(inverse, radius)[:, None]
 
-def check_renewal(plan, n: int, operator, conditions) -> tuple:
+        def smoothed(e):
+            x = share * known(e)
+            return x + step * A(x)
+
+        return *self.prolong.matrix(smoothed, coarse, self.aggregate), coarse
+
+    def product(self, A, prolong, restrict, constant) -> tuple[Any, Any]:
+        """The matrix on the next level, and its transpose."""
+        coarse = lambda e: restrict(A(prolong(e)))
+        return self.coarse.matrix(coarse, constant, jnp.arange(len(constant)))
+
+
+def check_renewal(plan, n: int, operator, conditions) -> tuple[Any, ...]:
     """The plan, and a problem that it serves, as constants."""
     if plan is None:
         raise ValueError(
@@ -145,7 +165,8 @@ def check_renewal(plan, n: int, operator, conditions) -> tuple:
 
 def plan_of(made: list, patterns: list) -> tuple[Coarsening, ...]:
     """What is kept of all levels, from the arguments of `Coarsening.of` but the last."""
-    return tuple(Coarsening.of(*one, b) for one, b in zip(made, [*patterns[1:], None]))
+    below = [*patterns[1:], None]
+    return tuple(Coarsening.of(t, p, c, v, b) for (t, p, c, v), b in zip(made, below))
 
 
 class Renewed(NamedTuple):
@@ -160,7 +181,7 @@ class Renewed(NamedTuple):
 
 
 def renewed_levels(
-    plan: tuple[Coarsening, ...], matrices: tuple[Callable, ...], divisor, constant, on
+    plan: tuple[Coarsening, ...], matrices: tuple[Any, ...], divisor, constant, on
 ) -> tuple[list[Renewed], tuple, Float[Array, " m"]]:
     """All levels of matrices with one hierarchy, that of the first; the coarsest ones, dense.
 
@@ -176,29 +197,12 @@ def renewed_levels(
         if levels:
             divisor = divisor_of(matrices[0])
             on = divisor != 0
-        inverse = inverted(divisor)
-        A, radius = matrices[0], radius_of(matrices[0], inverse, on)
-        size = len(step.prolong.color)
-        # The tentative prolongation has columns of norm one.
-        squares = jnp.zeros(size, constant.dtype).at[step.aggregate].add(constant**2, mode="drop")
-        norm = jnp.sqrt(squares)
-        known = lambda x, j=step.aggregate: x.at[j].get(mode="fill", fill_value=0)
-        share = constant * known(inverted(norm))
-
-        def smoothed(e, A=A, inverse=inverse, radius=radius, share=share, known=known):
-            x = share[:, None] * known(e)
-            return x + damped_step(inverse, radius)[:, None] * A(x)
-
-        prolong, restrict = step.prolong.matrix(smoothed, norm, step.aggregate)
+        A, inverse = matrices[0], inverted(divisor)
+        radius = radius_of(A, inverse, on)
+        prolong, restrict, constant = step.transfers(A, inverse, radius, constant)
         levels.append(Renewed(matrices, turned, divisor, radius, prolong, restrict))
-        below = [
-            step.coarse.matrix(
-                lambda e, A=A, P=prolong, R=restrict: R(A(P(e))), norm, jnp.arange(size)
-            )
-            for A in matrices
-        ]
+        below = [step.product(A, prolong, restrict, constant) for A in matrices]
         matrices, turned = zip(*below)
-        constant = norm
     if not plan:
         matrices = tuple(A(jnp.eye(len(constant), dtype=constant.dtype)) for A in matrices)
     return levels, matrices, constant
@@ -234,9 +238,9 @@ def divisor_of(matrix: PaddedMatrix) -> Float[Array, " m"]:
     """As `aggregation.divisor`."""
     rows, columns, extra = matrix.extra
     here = jnp.arange(matrix.indices.shape[1])
-    own = jnp.where(matrix.indices == here, matrix.weights, 0)
-    own = PaddedMatrix(matrix.indices, own, (rows, columns, jnp.where(rows == columns, extra, 0)))
-    ones = jnp.ones(len(here), own.weights.dtype)
+    weights = jnp.where(matrix.indices == here, matrix.weights, 0)
+    beside = (rows, columns, jnp.where(rows == columns, extra, 0))
+    own, ones = PaddedMatrix(matrix.indices, weights, beside), jnp.ones(len(here), weights.dtype)
     return stretched(own(ones), moduli(matrix)(ones) / 2)
 
 

@@ -2,6 +2,8 @@ r"""Multigrid for $1 - g A$ with any g, as implicit steps of changing length nee
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -54,9 +56,9 @@ class _Pair(eqx.Module):
     """
 
     mass: PaddedMatrix | None
-    stiff: PaddedMatrix | AbstractOperator
+    stiff: Any
     mass_turned: PaddedMatrix | None
-    stiff_turned: PaddedMatrix | None
+    stiff_turned: Any
     mass_diagonal: Float[Array, " m"]
     stiff_diagonal: Float[Array, " m"]
     restrict: PaddedMatrix
@@ -71,7 +73,7 @@ class _Pair(eqx.Module):
 
     def at(self, g) -> Level:
         inverse = 1 / (self.mass_diagonal - g * self.stiff_diagonal)
-        if self.mass is None:
+        if self.mass is None or self.mass_turned is None:
             matrix, turned = 1 - g * self.stiff, None
         else:
             matrix = self.mass.minus(g, self.stiff)

@@ -119,18 +119,15 @@ def step_preconditioner(
         >>> bool(jnp.abs(u - jnp.exp(-0.4) * u0).max() < 0.01)
         True
     """
-    shape = u0.shape if hasattr(u0, "shape") else None
-    laplacian, shifts = _factors(problem, shape or ())
-    if shape is None or u0.ndim not in (1, 2) or u0.shape[0] != laplacian.n:
-        shape = type(u0).__name__ if shape is None else shape
+    laplacian, shifts = _factors(problem, getattr(u0, "shape", ()))
+    if not hasattr(u0, "shape") or u0.ndim not in (1, 2) or u0.shape[0] != laplacian.n:
+        shape = u0.shape if hasattr(u0, "shape") else type(u0).__name__
         raise ValueError(f"u0 is {shape}, expected an array ({laplacian.n},) or ({laplacian.n}, c)")
     hierarchy = shifted_multigrid(laplacian, conditions=problem.conditions, renewable=renewable)
     return StepPreconditioner(hierarchy, shifts, jnp.shape(u0))
 
 
-def _factors(
-    problem: AbstractEvolution, shape: tuple[int, ...]
-) -> tuple[AbstractOperator, Partial]:
+def _factors(problem, shape: tuple[int, ...]) -> tuple[AbstractOperator, Partial]:
     """The Laplacian of a problem, and the function of g to the shifts."""
     hint = "like AdvectionDiffusionReaction(laplacian)"
     instance(problem, AbstractEvolution, "problem", hint)

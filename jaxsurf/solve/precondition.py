@@ -3,7 +3,6 @@ r"""Preconditioners: algebraic multigrid set up on the host, its cycle in JAX; a
 from __future__ import annotations
 
 import abc
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -14,6 +13,7 @@ from jaxtyping import Array, Float
 
 from ..arguments import instance, switched_off
 from ..boundary import Closure
+from ..compiling import sized_jit
 from ..stencils.algebra import AbstractOperator, Composition
 from ..stencils.padded import PaddedMatrix
 from ..stencils.stencil import Stencil
@@ -376,7 +376,7 @@ def _level(matrix, tentative, dtype, room: int, coarse: int, width, on):
     return level, prolong, (restrict @ (matrix @ prolong)).tocsr()
 
 
-@functools.partial(jax.jit, static_argnums=(3, 4))
+@sized_jit
 def _renewed(plan, operator, conditions, mean_zero: bool, dtype) -> Multigrid:
     matrix, restriction = free_operator(operator, conditions)
     below, free = free_divisor(operator, matrix, restriction)
@@ -385,7 +385,12 @@ def _renewed(plan, operator, conditions, mean_zero: bool, dtype) -> Multigrid:
     found, (dense,), constant = renewed_levels(plan, (matrix,), below, free, operator.active)
     levels = tuple(
         Level(
-            *v.matrices, *v.turned, inverted(v.divisor), v.restrict, v.prolong, chebyshev(v.radius)
+            v.matrices[0],
+            v.turned[0],
+            inverted(v.divisor),
+            v.restrict,
+            v.prolong,
+            chebyshev(v.radius),
         )
         for v in found
     )

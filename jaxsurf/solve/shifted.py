@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 from jaxtyping import Array, ArrayLike, Float
 
 from ..boundary import Closure
+from ..compiling import sized_jit
 from ..stencils.algebra import AbstractOperator
 from ..stencils.padded import PaddedMatrix
 from ..stencils.stencil import Stencil
@@ -196,7 +196,7 @@ def _pair(mass, stiff, tentative, room: int, coarse: int, width, on):
     return pair, prolong, *coarser
 
 
-@jax.jit
+@sized_jit
 def _renewed(plan, operator, conditions) -> ShiftedMultigrid:
     stiff, restriction = free_operator(operator, conditions)
     below, free = free_divisor(operator, stiff, restriction)

@@ -223,7 +223,8 @@ def _check(operator, rhs, conditions) -> None:
         )
     if not is_concrete(*jax.tree.leaves((rhs, conditions))):
         return
-    values = np.asarray(rhs if conditions is None else conditions(rhs))
+    with jax.ensure_compile_time_eval():  # constants, while the operator is traced
+        values = np.asarray(rhs if conditions is None else conditions(rhs))
     bad = np.flatnonzero(~np.isfinite(values).reshape(operator.n, -1).all(axis=1))
     if bad.size:
         what = "right-hand side or condition" if conditions is not None else "right-hand side"

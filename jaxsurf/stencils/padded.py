@@ -151,10 +151,9 @@ class PaddedMatrix(eqx.Module):
         return PaddedMatrix(self.indices, weights, (*self.extra[:2], extra))
 
     def __call__(self, x: Float[Array, "p *c"]) -> Float[Array, "m *c"]:
-        if x.ndim > 1:
-            return product(self.weights, self.indices, x, 0, self.extra)
         rows, columns, values = self.extra
         total = constant_product(self.weights, self.indices, x)
+        values = values.reshape(-1, *[1] * (x.ndim - 1))
         return total.at[rows].add(values * take(x, columns))
 
 

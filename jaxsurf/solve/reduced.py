@@ -45,7 +45,8 @@ def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
     if not is_concrete(*jax.tree.leaves((operator, conditions))):
         raise ValueError(
             "multigrid is set up on concrete arrays: call js.multigrid or js.step_preconditioner "
-            "outside jit and vmap, and pass its result as `preconditioner`"
+            "outside jit and vmap, and pass its result as `preconditioner`; with renewable=True, "
+            "renewed(...) serves traced operators"
         )
     matrix = operator.to_scipy()
     if not np.isfinite(matrix.data).all():

@@ -63,7 +63,7 @@ def solve(
         conditions: from `js.close` or `js.with_ghosts`.
         preconditioner: `js.multigrid(operator, conditions=conditions)` if None, also under
             `grad`; under `jit` and `vmap`, where values are not known, make it outside and pass
-            it. Or `js.jacobi(operator)`.
+            it, `renewed` inside where the operator is another. Or `js.jacobi(operator)`.
         solver: a solver of lineax; `js.BiCGStab(rtol, atol, max_steps)` if None.
         mean_zero: whether A annihilates the constants; seen from the preconditioner or a
             concrete operator if None.

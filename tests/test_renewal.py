@@ -53,7 +53,7 @@ def assert_same(one, other, rtol=1e-6):
     "kind", [pytest.param("closed", marks=pytest.mark.core), "dirichlet", "masked"]
 )
 def test_at_the_same_weights_the_numbers_are_those_of_the_host(kind):
-    cloud = js.PointCloud(CLOUD.points, CLOUD.normals, active=Z < 0.7)
+    cloud = js.PointCloud(CLOUD.points, CLOUD.normals, active=jnp.arange(N) % 3 > 0)
     operator = SURFACE.laplacian
     if kind == "masked":
         operator = js.laplace_beltrami(cloud, method=SURFACE.method)

@@ -17,27 +17,8 @@ from ..compiling import sized_jit
 from ..stencils.algebra import AbstractOperator, Composition
 from ..stencils.padded import PaddedMatrix
 from ..stencils.stencil import Stencil
-from .aggregation import (
-    aggregate,
-    chebyshev,
-    dense_inverse,
-    divisor,
-    filled,
-    jacobi_radius,
-    room_for,
-    smoothed,
-    transfers,
-)
+from . import aggregation, renewal
 from .reduced import annihilates_constants, check_kinds, free_operator, free_points, reduced_matrix
-from .renewal import (
-    Coarsening,
-    check_renewal,
-    free_divisor,
-    inverted,
-    narrowed,
-    plan_of,
-    renewed_levels,
-)
 
 # The coarsest system has at most this many unknowns and is solved by a dense inverse.
 _COARSEST = 400
@@ -154,7 +135,7 @@ class Multigrid(AbstractPreconditioner):
 
     levels: tuple[Level, ...]
     coarsest: Float[Array, "m m"]
-    plan: tuple[Coarsening, ...] | None = None
+    plan: tuple[renewal.Coarsening, ...] | None = None
 
     @property
     def n(self):
@@ -219,7 +200,7 @@ class Multigrid(AbstractPreconditioner):
             >>> bool(jnp.allclose(solved(2.0), solved(1.0) / 2))
             True
         """
-        problem = check_renewal(self.plan, self.n, operator, conditions)
+        problem = renewal.check_renewal(self.plan, self.n, operator, conditions)
         return _renewed(*problem, bool(self.mean_zero), self.coarsest.dtype)
 
 
@@ -333,11 +314,11 @@ def _hierarchy(operator, conditions, single: bool, renewable: bool) -> Multigrid
     constant = free.astype(float)
     room, on = fine.shape[0], operator.active
     while room > _COARSEST:
-        found = aggregate(fine, constant)
+        found = aggregation.aggregate(fine, constant)
         if found is None:
             break
         tentative, constant = found
-        coarse = room_for(tentative.shape[1], room)
+        coarse = aggregation.room_for(tentative.shape[1], room)
         level, prolong, fine = _level(fine, tentative, dtype, room, coarse, width, on)
         levels.append(level)
         made.append((tentative, prolong, fine, level))
@@ -349,8 +330,8 @@ def _hierarchy(operator, conditions, single: bool, renewable: bool) -> Multigrid
     dense[:size, :size] = fine.toarray()
     constant = np.append(constant, np.zeros(room - size))
     used = np.arange(room) < size
-    coarsest = dense_inverse(dense, used, constant if mean_zero else None).astype(dtype)
-    plan = plan_of(made, [(v.matrix, v.turned) for v in levels]) if renewable else None
+    coarsest = aggregation.dense_inverse(dense, used, constant if mean_zero else None).astype(dtype)
+    plan = renewal.plan_of(made, [(v.matrix, v.turned) for v in levels]) if renewable else None
     return Multigrid(mean_zero, tuple(levels), jnp.asarray(coarsest), plan)
 
 
@@ -360,18 +341,18 @@ def _level(matrix, tentative, dtype, room: int, coarse: int, width, on):
     if np.any(diagonal == 0):
         i = int(np.flatnonzero(diagonal == 0)[0])
         raise ValueError(f"the diagonal of the operator is zero in row {i}: nothing to smooth with")
-    inverse = 1 / divisor(matrix)
-    radius = jacobi_radius(matrix, inverse, on)
-    prolong = smoothed(matrix, tentative, inverse, radius)
+    inverse = 1 / aggregation.divisor(matrix)
+    radius = aggregation.jacobi_radius(matrix, inverse, on)
+    prolong = aggregation.smoothed(matrix, tentative, inverse, radius)
     restrict = prolong.T.tocsr()
     pad = lambda a, rows, width: PaddedMatrix.from_scipy(a, dtype, rows=rows, width=width)
     padded = pad(matrix, room, width)
     level = Level(
         padded,
         pad(matrix.T.tocsr(), room, width),
-        filled(inverse.astype(dtype), room),
-        *transfers(padded, restrict, prolong, coarse),
-        tuple(jnp.asarray(x, dtype) for x in chebyshev(radius)),
+        aggregation.filled(inverse.astype(dtype), room),
+        *aggregation.transfers(padded, restrict, prolong, coarse),
+        tuple(jnp.asarray(x, dtype) for x in aggregation.chebyshev(radius)),
     )
     return level, prolong, (restrict @ (matrix @ prolong)).tocsr()
 
@@ -379,20 +360,22 @@ def _level(matrix, tentative, dtype, room: int, coarse: int, width, on):
 @sized_jit
 def _renewed(plan, operator, conditions, mean_zero: bool, dtype) -> Multigrid:
     matrix, restriction = free_operator(operator, conditions)
-    below, free = free_divisor(operator, matrix, restriction)
+    below, free = renewal.free_divisor(operator, matrix, restriction)
     if conditions is not None or operator.active is not None:
         matrix, below = matrix + (1 - restriction), below + (1 - free)
-    found, (dense,), constant = renewed_levels(plan, (matrix,), below, free, operator.active)
+    found, (dense,), constant = renewal.renewed_levels(
+        plan, (matrix,), below, free, operator.active
+    )
     levels = tuple(
         Level(
             v.matrices[0],
             v.turned[0],
-            inverted(v.divisor),
+            renewal.inverted(v.divisor),
             v.restrict,
             v.prolong,
-            chebyshev(v.radius),
+            aggregation.chebyshev(v.radius),
         )
         for v in found
     )
-    coarsest = dense_inverse(dense, constant > 0, constant if mean_zero else None)
-    return Multigrid(mean_zero, narrowed(levels, dtype), coarsest.astype(dtype))
+    coarsest = aggregation.dense_inverse(dense, constant > 0, constant if mean_zero else None)
+    return Multigrid(mean_zero, renewal.narrowed(levels, dtype), coarsest.astype(dtype))

@@ -15,30 +15,9 @@ from ..compiling import sized_jit
 from ..stencils.algebra import AbstractOperator
 from ..stencils.padded import PaddedMatrix
 from ..stencils.stencil import Stencil
-from .aggregation import (
-    aggregate,
-    chebyshev,
-    divisor,
-    filled,
-    jacobi_radius,
-    room_for,
-    smoothed,
-    transfers,
-)
+from . import aggregation, renewal
 from .precondition import USED, Level, Multigrid
 from .reduced import check_kinds, free_matrix, free_operator
-from .renewal import (
-    Coarsening,
-    check_renewal,
-    divisor_of,
-    free_divisor,
-    inverted,
-    moduli,
-    narrowed,
-    plan_of,
-    radius_of,
-    renewed_levels,
-)
 
 # The coarsest system has at most this many unknowns; its inverse is computed for every g.
 _COARSEST = 100
@@ -69,7 +48,7 @@ class _Pair(eqx.Module):
     def patterns(self) -> tuple[PaddedMatrix, PaddedMatrix]:
         """Both matrices added in modulus, and the transpose of that."""
         both = (self.mass, self.stiff), (self.mass_turned, self.stiff_turned)
-        return tuple(moduli(mass).minus(-1, moduli(stiff)) for mass, stiff in both)
+        return tuple(renewal.moduli(mass).minus(-1, renewal.moduli(stiff)) for mass, stiff in both)
 
     def at(self, g) -> Level:
         inverse = 1 / (self.mass_diagonal - g * self.stiff_diagonal)
@@ -85,7 +64,7 @@ class _Pair(eqx.Module):
             self.restrict,
             self.prolong,
             # Its roots are of double precision, the cycle is not.
-            tuple(x.astype(self.radius.dtype) for x in chebyshev(self.radius)),
+            tuple(x.astype(self.radius.dtype) for x in aggregation.chebyshev(self.radius)),
         )
 
 
@@ -101,7 +80,7 @@ class ShiftedMultigrid(eqx.Module):
     pairs: tuple[_Pair, ...]
     mass: Float[Array, "m m"]
     stiff: Float[Array, "m m"]
-    plan: tuple[Coarsening, ...] | None = None
+    plan: tuple[renewal.Coarsening, ...] | None = None
 
     def at(self, g: ArrayLike) -> Multigrid:
         """The V-cycle for one g, which may be traced."""
@@ -114,7 +93,7 @@ class ShiftedMultigrid(eqx.Module):
     ) -> ShiftedMultigrid:
         """The hierarchies of another operator on the same points, as `Multigrid.renewed`."""
         n = len(self.pairs[0].stiff_diagonal if self.pairs else self.stiff)
-        return _renewed(*check_renewal(self.plan, n, operator, conditions))
+        return _renewed(*renewal.check_renewal(self.plan, n, operator, conditions))
 
 
 def shifted_multigrid(
@@ -145,11 +124,11 @@ def shifted_multigrid(
     room, on = stiff.shape[0], operator.active
     pairs, made = [], []
     while room > _COARSEST:
-        found = aggregate(stiff, constant)
+        found = aggregation.aggregate(stiff, constant)
         if found is None:
             break
         tentative, constant = found
-        coarse = room_for(tentative.shape[1], room)
+        coarse = aggregation.room_for(tentative.shape[1], room)
         pair, prolong, mass, stiff = _pair(mass, stiff, tentative, room, coarse, width, on)
         pairs.append(pair)
         made.append((tentative, prolong, abs(mass) + abs(stiff), pair))
@@ -158,7 +137,7 @@ def shifted_multigrid(
     mass, stiff = _dense(mass, room, 1), _dense(stiff, room, 0)
     plan = None
     if renewable:
-        plan = plan_of(made, [pair.patterns for pair in pairs])
+        plan = renewal.plan_of(made, [pair.patterns for pair in pairs])
     return ShiftedMultigrid(tuple(pairs), jnp.asarray(mass), jnp.asarray(stiff), plan)
 
 
@@ -171,10 +150,10 @@ def _dense(matrix, room: int, diagonal: float) -> np.ndarray:
 
 def _pair(mass, stiff, tentative, room: int, coarse: int, width, on):
     """A level, and M and A on the next one."""
-    below, beside = divisor(stiff), divisor(mass)
+    below, beside = aggregation.divisor(stiff), aggregation.divisor(mass)
     inverse = np.divide(1, below, out=np.zeros_like(below), where=below != 0)
-    radius = jacobi_radius(stiff, inverse, on)
-    prolong = smoothed(stiff, tentative, inverse, radius)
+    radius = aggregation.jacobi_radius(stiff, inverse, on)
+    prolong = aggregation.smoothed(stiff, tentative, inverse, radius)
     restrict = prolong.T.tocsr()
     # In one complex matrix both get one layout.
     both = (mass + 1j * stiff).tocsr()
@@ -187,10 +166,10 @@ def _pair(mass, stiff, tentative, room: int, coarse: int, width, on):
         pad(both.imag),
         pad(turned.real),
         pad(turned.imag),
-        filled(beside.astype(single), room, 1),
-        filled(below.astype(single), room),
-        *transfers(padded, restrict, prolong, coarse),
-        jnp.asarray(max(radius, jacobi_radius(mass, 1 / beside)), single),
+        aggregation.filled(beside.astype(single), room, 1),
+        aggregation.filled(below.astype(single), room),
+        *aggregation.transfers(padded, restrict, prolong, coarse),
+        jnp.asarray(max(radius, aggregation.jacobi_radius(mass, 1 / beside)), single),
     )
     coarser = ((restrict @ (a @ prolong)).tocsr() for a in (mass, stiff))
     return pair, prolong, *coarser
@@ -199,9 +178,9 @@ def _pair(mass, stiff, tentative, room: int, coarse: int, width, on):
 @sized_jit
 def _renewed(plan, operator, conditions) -> ShiftedMultigrid:
     stiff, restriction = free_operator(operator, conditions)
-    below, free = free_divisor(operator, stiff, restriction)
+    below, free = renewal.free_divisor(operator, stiff, restriction)
     matrices = stiff, lambda x: x
-    found, (stiff, mass), _ = renewed_levels(plan, matrices, below, free, operator.active)
+    found, (stiff, mass), _ = renewal.renewed_levels(plan, matrices, below, free, operator.active)
     pairs = []
     for depth, v in enumerate(found):
         (stiff_here, mass_here), (stiff_turned, mass_turned) = v.matrices, v.turned
@@ -209,8 +188,8 @@ def _renewed(plan, operator, conditions) -> ShiftedMultigrid:
         if depth == 0:
             mass_here = None
         else:
-            size = divisor_of(mass_here)
-            radius = radius_of(mass_here, inverted(size), size != 0)
+            size = renewal.divisor_of(mass_here)
+            radius = renewal.radius_of(mass_here, renewal.inverted(size), size != 0)
             beside = jnp.where(size == 0, 1, size)
         diagonals, transfers = (beside, v.divisor), (v.restrict, v.prolong)
         radius = jnp.maximum(v.radius, radius)
@@ -219,4 +198,4 @@ def _renewed(plan, operator, conditions) -> ShiftedMultigrid:
         )
     # The unknowns that fill it up have the equation x = 0.
     mass = mass + jnp.diag(jnp.where(jnp.diagonal(mass) == 0, 1, 0))
-    return narrowed(ShiftedMultigrid(tuple(pairs), mass, stiff), np.dtype(np.float32))
+    return renewal.narrowed(ShiftedMultigrid(tuple(pairs), mass, stiff), np.dtype(np.float32))

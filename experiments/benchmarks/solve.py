@@ -106,13 +106,33 @@ def poisson_gradient(n: int) -> dict:
     return {"gradient s": both, "solve s": alone, "gradient / solve": ratio}
 
 
+def renewal(n: int) -> dict:
+    """A hierarchy's numbers computed again, beside its set-up and a build of the Laplacian."""
+    surface = js.discretize(js.sphere(n), method=js.GFDM(degree=2))
+    laplacian = surface.laplacian
+    cycle = js.multigrid(laplacian, renewable=True)
+    renew = lambda: cycle.renewed(laplacian).coarsest
+    first, seconds = first_and_median(renew, 5)
+    lists = {"neighbors": surface.neighbors, "method": surface.method}
+    build = lambda: js.laplace_beltrami(surface.cloud, **lists).weights
+    setup = lambda: js.multigrid(laplacian, renewable=True).coarsest
+    return {
+        "renewal s": seconds, "compile s": first - seconds,
+        "renewal / build": side_by_side(renew, build, 7)[2],
+        "renewal / set-up": side_by_side(renew, setup, 7)[2],
+        "renewable / plain set-up": side_by_side(
+            setup, lambda: js.multigrid(laplacian).coarsest, 7
+        )[2],
+    }  # fmt: skip
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    cases = [poisson, poisson_beside_scipy, poisson_gradient, renewal]
     parser.add_argument("--n", type=int, default=100_000)
-    parser.add_argument("--case", choices=["poisson", "poisson_beside_scipy", "poisson_gradient"])
+    parser.add_argument("--case", choices=[case.__name__ for case in cases])
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    cases = [poisson, poisson_beside_scipy, poisson_gradient]
     chosen = [c for c in cases if options.case in (None, c.__name__)]
     print(json.dumps({case.__name__: case(options.n) for case in chosen}))
 

@@ -3,31 +3,27 @@ r"""Preconditioners: algebraic multigrid set up on the host, its cycle in JAX; a
 from __future__ import annotations
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
 from jaxtyping import Array, Float
 
 from ..arguments import instance, switched_off
 from ..boundary import Closure
-from ..stencils.algebra import AbstractOperator, Composition, check_scalar
+from ..compiling import sized_jit
+from ..stencils.algebra import AbstractOperator, Composition
 from ..stencils.padded import PaddedMatrix
 from ..stencils.stencil import Stencil
-from .reduced import annihilates_constants, free_points, reduced_matrix
+from . import aggregation, renewal
+from .reduced import annihilates_constants, check_kinds, free_operator, free_points, reduced_matrix
 
 # The coarsest system has at most this many unknowns and is solved by a dense inverse.
 _COARSEST = 400
-# Room on the next level: one unknown for so many; a tenth to a twentieth are used as a rule.
-_COARSENING = 8
 # Share of a stencil's slots that lie within its support, at most.
 USED = 0.85
-# A connection counts as strong from this share of the geometric mean of both diagonal entries.
-_STRENGTH = 0.05
-# The smoother damps the part of the spectrum from this share of its end upwards.
-_SMOOTHED = 0.25
 
 
 class AbstractPreconditioner(AbstractOperator):
@@ -82,15 +78,15 @@ class Level(eqx.Module):
 
     Args:
         matrix: the operator on this level.
-        turned: its transpose.
+        turned: its transpose; None where that is at hand.
         inverse: of the diagonal.
         restrict: to the next coarser level.
         prolong: from there.
         damping: factors of the smoothing steps.
     """
 
-    matrix: PaddedMatrix
-    turned: PaddedMatrix
+    matrix: PaddedMatrix | AbstractOperator
+    turned: PaddedMatrix | AbstractOperator | None
     inverse: Float[Array, " n"]
     restrict: PaddedMatrix
     prolong: PaddedMatrix
@@ -115,6 +111,13 @@ class Level(eqx.Module):
 
         return jax.lax.scan(step, (jnp.zeros_like(b), b), jnp.stack(self.damping))[0]
 
+    @property
+    def T(self) -> Level:
+        # The prolongation is the transposed restriction: both stay. So do polynomials in
+        # D⁻¹A times D⁻¹, with A transposed.
+        turned = self.matrix.T if self.turned is None else self.turned  # type: ignore[union-attr]
+        return Level(turned, self.matrix, self.inverse, self.restrict, self.prolong, self.damping)
+
 
 class Multigrid(AbstractPreconditioner):
     """A V-cycle of smoothed aggregation: made by `multigrid`.
@@ -122,6 +125,7 @@ class Multigrid(AbstractPreconditioner):
     Args:
         levels: from fine to coarse.
         coarsest: inverse of the coarsest operator.
+        plan: what `renewed` needs of each level.
 
     Example:
         >>> cycle = js.multigrid(js.laplace_beltrami(js.sphere(300)))
@@ -131,6 +135,7 @@ class Multigrid(AbstractPreconditioner):
 
     levels: tuple[Level, ...]
     coarsest: Float[Array, "m m"]
+    plan: tuple[renewal.Coarsening, ...] | None = None
 
     @property
     def n(self):
@@ -163,20 +168,47 @@ class Multigrid(AbstractPreconditioner):
         return level.smooth(x, b)
 
     def transpose(self):
-        # The prolongation is the transposed restriction: both stay. So do polynomials in
-        # D⁻¹A times D⁻¹, with A transposed.
-        levels = tuple(
-            Level(v.turned, v.matrix, v.inverse, v.restrict, v.prolong, v.damping)
-            for v in self.levels
-        )
-        return Multigrid(self.mean_zero, levels, self.coarsest.T)
+        return Multigrid(self.mean_zero, tuple(v.T for v in self.levels), self.coarsest.T)
+
+    def renewed(
+        self, operator: AbstractOperator, *, conditions: Closure | None = None
+    ) -> Multigrid:
+        r"""The hierarchy of another operator on the same points: same aggregates, other numbers.
+
+        Runs under `jit`, `vmap` and `grad`, for traced weights and neighbours, conditions and
+        masks; other values compile nothing. A constant for derivatives. Where neighbours are
+        not those of the first operator, entries that its patterns do not hold are lumped.
+
+        Args:
+            operator: scalar; one of which the diagonal is known. It annihilates the constants if
+                the first one did.
+            conditions: from `js.close` or `js.with_ghosts`; if there were some at first.
+
+        Raises:
+            TypeError: what is no operator or closure.
+            ValueError: a hierarchy made without `renewable=True`; an operator for another number
+                of points, with components, or of unknown diagonal.
+
+        Example:
+            >>> laplacian = js.laplace_beltrami(js.sphere(500))
+            >>> cycle = js.multigrid(laplacian, renewable=True)
+            >>> rhs = laplacian(jnp.arange(500.0))
+            >>> @jax.jit
+            ... def solved(factor):
+            ...     operator = factor * laplacian
+            ...     return js.solve(operator, rhs, preconditioner=cycle.renewed(operator)).value
+            >>> bool(jnp.allclose(solved(2.0), solved(1.0) / 2))
+            True
+        """
+        problem = renewal.check_renewal(self.plan, self.n, operator, conditions)
+        return _renewed(*problem, bool(self.mean_zero), self.coarsest.dtype)
 
 
 class _Product(AbstractPreconditioner):
     """One preconditioner after another, for a composition of operators."""
 
-    outer: AbstractPreconditioner
-    inner: AbstractPreconditioner
+    outer: Any
+    inner: Any
 
     @classmethod
     def of(cls, outer, inner):
@@ -192,6 +224,11 @@ class _Product(AbstractPreconditioner):
 
     def transpose(self):
         return _Product.of(self.inner.transpose(), self.outer.transpose())
+
+    def renewed(self, operator, *, conditions=None):
+        instance(operator, Composition, "operator", "as the hierarchy was made for")
+        pairs = (self.outer, operator.outer), (self.inner, operator.inner)
+        return _Product.of(*(p.renewed(o, conditions=conditions) for p, o in pairs))
 
 
 def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> Jacobi:
@@ -215,7 +252,7 @@ def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> 
         >>> bool((js.jacobi(screened).divisor > 0).all())
         True
     """
-    _check_kinds(operator, conditions)
+    check_kinds(operator, conditions)
     diagonal = operator.diagonal
     diagonal = switched_off(operator.active, diagonal, 1)
     if conditions is not None:
@@ -228,6 +265,7 @@ def multigrid(
     *,
     conditions: Closure | None = None,
     single: bool = True,
+    renewable: bool = False,
 ) -> AbstractPreconditioner:
     r"""Smoothed-aggregation multigrid (Vaněk, Mandel and Brezina 1996) as a preconditioner.
 
@@ -235,7 +273,7 @@ def multigrid(
     dense coarsest solve, is plain JAX on padded arrays: it runs under `jit` and `vmap`, and its
     exact transpose serves adjoint solves. It is a constant for derivatives; a hierarchy made
     for one operator serves nearby ones too (other weights on the same neighbours), at the
-    price of more steps.
+    price of more steps, or is renewed.
 
     Args:
         operator: scalar, with concrete arrays. For an indefinite Helmholtz operator
@@ -243,6 +281,7 @@ def multigrid(
         conditions: from `js.close` or `js.with_ghosts`; the same as for `js.solve`.
         single: hold and run the cycle in single precision, which halves its time. The solution
             is not affected: its residual is computed in the precision of the operator.
+        renewable: keep what `Multigrid.renewed` needs to serve other weights in compiled code.
 
     Returns:
         To be passed to `js.solve`. A composition gets one hierarchy for each factor.
@@ -258,162 +297,85 @@ def multigrid(
         >>> len(js.multigrid(laplacian).levels)
         1
     """
-    _check_kinds(operator, conditions)
+    check_kinds(operator, conditions)
     if isinstance(operator, Composition) and conditions is None:
-        return _Product.of(*(multigrid(o, single=single) for o in (operator.outer, operator.inner)))
-    return _hierarchy(operator, conditions, single)
+        both = operator.outer, operator.inner
+        return _Product.of(*(multigrid(o, single=single, renewable=renewable) for o in both))
+    return _hierarchy(operator, conditions, single, renewable)
 
 
-def _check_kinds(operator, conditions) -> None:
-    instance(operator, AbstractOperator, "operator", "js.laplace_beltrami(cloud) makes one")
-    check_scalar(operator)
-    if conditions is not None:
-        hint = "js.close(cloud, conditions) makes one of conditions"
-        instance(conditions, Closure, "conditions", hint)
-
-
-def _hierarchy(operator, conditions, single: bool) -> Multigrid:
-    matrix = reduced_matrix(operator, conditions)
+def _hierarchy(operator, conditions, single: bool, renewable: bool) -> Multigrid:
+    fine = reduced_matrix(operator, conditions)
     free = free_points(operator, conditions)
-    mean_zero = annihilates_constants(matrix, free)
-    dtype = np.dtype(np.float32) if single else matrix.dtype
+    mean_zero = annihilates_constants(fine, free)
+    dtype = np.dtype(np.float32) if single else fine.dtype
     width = USED * operator.k if isinstance(operator, Stencil) else None
-    levels = []
+    levels, made = [], []
     constant = free.astype(float)
-    fine, room, on = matrix, matrix.shape[0], operator.active
+    room, on = fine.shape[0], operator.active
     while room > _COARSEST:
-        found = aggregate(fine, constant)
+        found = aggregation.aggregate(fine, constant)
         if found is None:
             break
         tentative, constant = found
-        coarse = room_for(tentative.shape[1], room)
-        level, fine = _level(fine, tentative, dtype, room, coarse, width, on)
+        coarse = aggregation.room_for(tentative.shape[1], room)
+        level, prolong, fine = _level(fine, tentative, dtype, room, coarse, width, on)
         levels.append(level)
+        made.append((tentative, prolong, fine, level))
         room, width, on = coarse, None, None
-    if fine.shape[0] > 4 * _COARSEST:
-        raise ValueError(
-            f"coarsening stopped at {fine.shape[0]} unknowns: too few strong connections"
-        )
-    coarsest = np.zeros((room, room), dtype)
-    part = slice(fine.shape[0])
-    coarsest[part, part] = _inverse(fine, constant if mean_zero else None)
-    return Multigrid(mean_zero, tuple(levels), jnp.asarray(coarsest))
-
-
-# --- set-up on the host --------------------------------------------------------------------
-
-
-def room_for(unknowns: int, finer: int) -> int:
-    """What a level is padded to: a share of the room on the finer one, so that few sizes occur."""
-    room = -(-finer // _COARSENING)
-    while room < unknowns:
-        room *= 2
-    return room
-
-
-def filled(a: np.ndarray, room: int, value: float = 0.0) -> Array:
-    """The array with values appended."""
-    return jnp.asarray(np.append(a, np.full(room - len(a), value, a.dtype)))
-
-
-def aggregate(matrix, constant):
-    """Tentative prolongation and the coarse constants; None if nothing can be aggregated."""
-    try:
-        from pyamg.aggregation import fit_candidates, standard_aggregation
-        from pyamg.strength import symmetric_strength_of_connection
-    except ImportError as error:
-        raise ImportError(
-            "js.multigrid needs pyamg: pip install 'jaxsurf[multigrid]'. Without it pass "
-            "preconditioner=js.jacobi(operator), which takes more steps"
-        ) from error
-    strong = symmetric_strength_of_connection(matrix, theta=_STRENGTH)
-    aggregates = standard_aggregation(strong)[0]
-    if aggregates.shape[1] == 0 or aggregates.shape[1] > 0.8 * matrix.shape[0]:
-        return None
-    tentative, coarse = fit_candidates(aggregates, constant[:, None])
-    return scipy.sparse.csr_matrix(tentative), coarse[:, 0]
+    size = fine.shape[0]
+    if size > 4 * _COARSEST:
+        raise ValueError(f"coarsening stopped at {size} unknowns: too few strong connections")
+    dense = np.zeros((room, room), fine.dtype)
+    dense[:size, :size] = fine.toarray()
+    constant = np.append(constant, np.zeros(room - size))
+    used = np.arange(room) < size
+    coarsest = aggregation.dense_inverse(dense, used, constant if mean_zero else None).astype(dtype)
+    plan = renewal.plan_of(made, [(v.matrix, v.turned) for v in levels]) if renewable else None
+    return Multigrid(mean_zero, tuple(levels), jnp.asarray(coarsest), plan)
 
 
 def _level(matrix, tentative, dtype, room: int, coarse: int, width, on):
-    """A level, and the operator on the next one."""
+    """A level, its prolongation, and the operator on the next one."""
     diagonal = matrix.diagonal()
     if np.any(diagonal == 0):
         i = int(np.flatnonzero(diagonal == 0)[0])
         raise ValueError(f"the diagonal of the operator is zero in row {i}: nothing to smooth with")
-    inverse = 1 / divisor(matrix)
-    radius = jacobi_radius(matrix, inverse, on)
-    prolong = smoothed(matrix, tentative, inverse, radius)
+    inverse = 1 / aggregation.divisor(matrix)
+    radius = aggregation.jacobi_radius(matrix, inverse, on)
+    prolong = aggregation.smoothed(matrix, tentative, inverse, radius)
     restrict = prolong.T.tocsr()
     pad = lambda a, rows, width: PaddedMatrix.from_scipy(a, dtype, rows=rows, width=width)
     padded = pad(matrix, room, width)
     level = Level(
         padded,
         pad(matrix.T.tocsr(), room, width),
-        filled(inverse.astype(dtype), room),
-        *transfers(padded, restrict, prolong, coarse),
-        tuple(jnp.asarray(x, dtype) for x in chebyshev(radius)),
+        aggregation.filled(inverse.astype(dtype), room),
+        *aggregation.transfers(padded, restrict, prolong, coarse),
+        tuple(jnp.asarray(x, dtype) for x in aggregation.chebyshev(radius)),
     )
-    return level, (restrict @ (matrix @ prolong)).tocsr()
+    return level, prolong, (restrict @ (matrix @ prolong)).tocsr()
 
 
-def transfers(padded, restrict, prolong, coarse: int) -> tuple[PaddedMatrix, PaddedMatrix]:
-    """Restriction and prolongation next to a level's matrix, as padded arrays."""
-    # About as wide as they are on surfaces.
-    (k, rows), dtype = padded.indices.shape, padded.weights.dtype
-    return (
-        PaddedMatrix.from_scipy(restrict, dtype, rows=coarse, width=2.2 * k + 12),
-        # Few slots: rather some too many than another number on the next surface.
-        PaddedMatrix.from_scipy(prolong, dtype, rows=rows, width=0.16 * k + 2, step=0.5),
+@sized_jit
+def _renewed(plan, operator, conditions, mean_zero: bool, dtype) -> Multigrid:
+    matrix, restriction = free_operator(operator, conditions)
+    below, free = renewal.free_divisor(operator, matrix, restriction)
+    if conditions is not None or operator.active is not None:
+        matrix, below = matrix + (1 - restriction), below + (1 - free)
+    found, (dense,), constant = renewal.renewed_levels(
+        plan, (matrix,), below, free, operator.active
     )
-
-
-def divisor(matrix) -> np.ndarray:
-    """What Jacobi's steps divide by.
-
-    At points with a small diagonal (few, badly placed neighbours) plain ones would diverge. Half
-    the sum of a row's moduli, the diagonal where weights are of one sign, keeps the row sums of
-    D⁻¹A below 2.
-    """
-    diagonal = matrix.diagonal()
-    return np.sign(diagonal) * np.maximum(
-        np.abs(diagonal), abs(matrix) @ np.full(len(diagonal), 0.5)
+    levels = tuple(
+        Level(
+            v.matrices[0],
+            v.turned[0],
+            renewal.inverted(v.divisor),
+            v.restrict,
+            v.prolong,
+            aggregation.chebyshev(v.radius),
+        )
+        for v in found
     )
-
-
-def smoothed(matrix, tentative, inverse, radius) -> scipy.sparse.csr_matrix:
-    """Prolongation after a step of Jacobi's, (I - w D⁻¹ A) T."""
-    damped = matrix.copy()
-    damped.data *= np.repeat(-4 / 3 / radius * inverse, np.diff(matrix.indptr))
-    return (tentative + damped @ tentative).tocsr()
-
-
-def jacobi_radius(matrix, inverse, on=None, steps: int = 8) -> float:
-    """Spectral radius of D⁻¹A, of the points that are on, by the power method.
-
-    A few per cent too small.
-    """
-    v = np.zeros(matrix.shape[0])
-    rows = slice(None) if on is None else np.flatnonzero(np.asarray(on))
-    v[rows] = np.random.default_rng(0).normal(size=v[rows].size)
-    for _ in range(steps):
-        v = inverse * (matrix @ v)
-        size = np.sqrt(np.sum(v * v))
-        v /= size
-    return float(size)
-
-
-def chebyshev(radius, degree: int = 2) -> tuple:
-    """Step sizes at the roots of the Chebyshev polynomial on the upper part of the spectrum."""
-    low, high = _SMOOTHED * radius, 1.1 * radius
-    roots = np.cos(np.pi * (np.arange(degree) + 0.5) / degree)
-    return tuple(1 / ((low + high) / 2 + (high - low) / 2 * roots))
-
-
-def _inverse(matrix, constant) -> np.ndarray:
-    """Dense inverse; on the complement of the constants where these are in the null space."""
-    dense = matrix.toarray()
-    if constant is None:
-        return np.linalg.inv(dense)
-    border = constant[:, None] * np.abs(dense).max() / np.linalg.norm(constant)
-    bordered = np.block([[dense, border], [border.T, np.zeros((1, 1))]])
-    return np.linalg.inv(bordered)[:-1, :-1]
+    coarsest = aggregation.dense_inverse(dense, constant > 0, constant if mean_zero else None)
+    return Multigrid(mean_zero, renewal.narrowed(levels, dtype), coarsest.astype(dtype))

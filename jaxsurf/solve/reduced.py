@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
+from ..arguments import as_many, instance
+from ..boundary import Closure, Restriction
 from ..failures import is_concrete, without_derivatives
+from ..stencils.algebra import AbstractOperator, check_scalar
 
 # Row sums up to this many times round-off are those of an operator that annihilates constants.
 _ROUNDOFF = 32
+
+
+def check_kinds(operator, conditions) -> None:
+    """Refuse what is no operator on scalar fields, and what are no conditions for it."""
+    instance(operator, AbstractOperator, "operator", "js.laplace_beltrami(cloud) makes one")
+    check_scalar(operator)
+    if conditions is not None:
+        hint = "js.close(cloud, conditions) makes one of conditions"
+        instance(conditions, Closure, "conditions", hint)
+        as_many("conditions", conditions.n, "the operator", operator.n)
+
+
+def free_operator(operator, conditions) -> tuple[AbstractOperator, Restriction]:
+    """P A E and P as operators."""
+    restriction = Restriction(operator.n, conditions, operator.active)
+    if conditions is not None:
+        operator = operator @ conditions.extension
+    all_free = conditions is None and restriction.on is None
+    return operator if all_free else restriction @ operator, restriction
 
 
 def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
@@ -20,18 +41,17 @@ def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
         ValueError: traced or non-finite weights.
     """
     operator, conditions = without_derivatives((operator, conditions))
-    if not is_concrete(*jax.tree.leaves((operator, conditions))):
+    if not is_concrete(operator, conditions):
         raise ValueError(
             "multigrid is set up on concrete arrays: call js.multigrid or js.step_preconditioner "
-            "outside jit and vmap, and pass its result as `preconditioner`"
+            "outside jit and vmap, and pass its result as `preconditioner`; with renewable=True, "
+            "renewed(...) serves traced operators"
         )
     matrix = operator.to_scipy()
     if not np.isfinite(matrix.data).all():
         i = np.searchsorted(matrix.indptr, np.argmin(np.isfinite(matrix.data)), "right") - 1
         raise ValueError(f"the operator has weights that are not finite, first at point {i}")
     if conditions is not None:
-        if conditions.n != operator.n:
-            raise ValueError(f"conditions for {conditions.n} points, the operator has {operator.n}")
         restriction, extension = (
             part.to_scipy() for part in (conditions.restriction, conditions.extension)
         )

@@ -2,6 +2,8 @@ r"""Multigrid for $1 - g A$ with any g, as implicit steps of changing length nee
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -9,23 +11,13 @@ import scipy.sparse
 from jaxtyping import Array, ArrayLike, Float
 
 from ..boundary import Closure
-from ..stencils.algebra import AbstractOperator, check_scalar
+from ..compiling import sized_jit
+from ..stencils.algebra import AbstractOperator
 from ..stencils.padded import PaddedMatrix
 from ..stencils.stencil import Stencil
-from .precondition import (
-    USED,
-    Level,
-    Multigrid,
-    aggregate,
-    chebyshev,
-    divisor,
-    filled,
-    jacobi_radius,
-    room_for,
-    smoothed,
-    transfers,
-)
-from .reduced import free_matrix
+from . import aggregation, renewal
+from .precondition import USED, Level, Multigrid
+from .reduced import check_kinds, free_matrix, free_operator
 
 # The coarsest system has at most this many unknowns; its inverse is computed for every g.
 _COARSEST = 100
@@ -35,33 +27,44 @@ class _Pair(eqx.Module):
     """A level of the identity M and of A, with one layout.
 
     Args:
-        mass, stiff: M and A.
-        mass_turned, stiff_turned: their transposes.
+        mass, stiff: M and A; M is None on the finest level of a renewed hierarchy.
+        mass_turned, stiff_turned: their transposes; None there.
         mass_diagonal, stiff_diagonal: what to divide by; safe for rows of both signs.
         restrict, prolong: to and from the next coarser level.
         radius: of either after division by its diagonal, the larger.
     """
 
-    mass: PaddedMatrix
-    stiff: PaddedMatrix
-    mass_turned: PaddedMatrix
-    stiff_turned: PaddedMatrix
+    mass: PaddedMatrix | None
+    stiff: Any
+    mass_turned: PaddedMatrix | None
+    stiff_turned: Any
     mass_diagonal: Float[Array, " m"]
     stiff_diagonal: Float[Array, " m"]
     restrict: PaddedMatrix
     prolong: PaddedMatrix
     radius: Float[Array, ""]
 
+    @property
+    def patterns(self) -> tuple[PaddedMatrix, PaddedMatrix]:
+        """Both matrices added in modulus, and the transpose of that."""
+        both = (self.mass, self.stiff), (self.mass_turned, self.stiff_turned)
+        return tuple(renewal.moduli(mass).minus(-1, renewal.moduli(stiff)) for mass, stiff in both)
+
     def at(self, g) -> Level:
         inverse = 1 / (self.mass_diagonal - g * self.stiff_diagonal)
+        if self.mass is None or self.mass_turned is None:
+            matrix, turned = 1 - g * self.stiff, None
+        else:
+            matrix = self.mass.minus(g, self.stiff)
+            turned = self.mass_turned.minus(g, self.stiff_turned)
         return Level(
-            self.mass.minus(g, self.stiff),
-            self.mass_turned.minus(g, self.stiff_turned),
+            matrix,
+            turned,
             inverse,
             self.restrict,
             self.prolong,
             # Its roots are of double precision, the cycle is not.
-            tuple(x.astype(self.radius.dtype) for x in chebyshev(self.radius)),
+            tuple(x.astype(self.radius.dtype) for x in aggregation.chebyshev(self.radius)),
         )
 
 
@@ -71,11 +74,13 @@ class ShiftedMultigrid(eqx.Module):
     Args:
         pairs: levels, from fine to coarse.
         mass, stiff: the coarsest level, dense.
+        plan: what `renewed` needs of each level.
     """
 
     pairs: tuple[_Pair, ...]
     mass: Float[Array, "m m"]
     stiff: Float[Array, "m m"]
+    plan: tuple[renewal.Coarsening, ...] | None = None
 
     def at(self, g: ArrayLike) -> Multigrid:
         """The V-cycle for one g, which may be traced."""
@@ -83,9 +88,16 @@ class ShiftedMultigrid(eqx.Module):
         levels = tuple(pair.at(g) for pair in self.pairs)
         return Multigrid(False, levels, jnp.linalg.inv(self.mass - g * self.stiff))
 
+    def renewed(
+        self, operator: AbstractOperator, *, conditions: Closure | None = None
+    ) -> ShiftedMultigrid:
+        """The hierarchies of another operator on the same points, as `Multigrid.renewed`."""
+        n = len(self.pairs[0].stiff_diagonal if self.pairs else self.stiff)
+        return _renewed(*renewal.check_renewal(self.plan, n, operator, conditions))
+
 
 def shifted_multigrid(
-    operator: AbstractOperator, *, conditions: Closure | None = None
+    operator: AbstractOperator, *, conditions: Closure | None = None, renewable: bool = False
 ) -> ShiftedMultigrid:
     r"""Set up smoothed aggregation for $1 - g A$ once, for all g ≥ 0.
 
@@ -95,6 +107,7 @@ def shifted_multigrid(
     Args:
         operator: A, scalar, with concrete arrays and eigenvalues of real part ≤ 0.
         conditions: from `js.close` or `js.with_ghosts`.
+        renewable: keep what `ShiftedMultigrid.renewed` needs.
 
     Returns:
         Whose `at(g)` is a preconditioner.
@@ -103,25 +116,29 @@ def shifted_multigrid(
         ImportError: pyamg is not installed (extra `multigrid`).
         ValueError: an operator that is traced, not finite, or has components.
     """
-    check_scalar(operator)
+    check_kinds(operator, conditions)
     stiff = free_matrix(operator, conditions)
     mass = scipy.sparse.identity(stiff.shape[0], stiff.dtype, format="csr")
     constant = np.ones(stiff.shape[0])
     width = USED * operator.k if isinstance(operator, Stencil) else None
     room, on = stiff.shape[0], operator.active
-    pairs = []
+    pairs, made = [], []
     while room > _COARSEST:
-        found = aggregate(stiff, constant)
+        found = aggregation.aggregate(stiff, constant)
         if found is None:
             break
         tentative, constant = found
-        coarse = room_for(tentative.shape[1], room)
-        pair, mass, stiff = _pair(mass, stiff, tentative, room, coarse, width, on)
+        coarse = aggregation.room_for(tentative.shape[1], room)
+        pair, prolong, mass, stiff = _pair(mass, stiff, tentative, room, coarse, width, on)
         pairs.append(pair)
+        made.append((tentative, prolong, abs(mass) + abs(stiff), pair))
         room, width, on = coarse, None, None
     # The unknowns that fill it up have the equation x = 0.
     mass, stiff = _dense(mass, room, 1), _dense(stiff, room, 0)
-    return ShiftedMultigrid(tuple(pairs), jnp.asarray(mass), jnp.asarray(stiff))
+    plan = None
+    if renewable:
+        plan = renewal.plan_of(made, [pair.patterns for pair in pairs])
+    return ShiftedMultigrid(tuple(pairs), jnp.asarray(mass), jnp.asarray(stiff), plan)
 
 
 def _dense(matrix, room: int, diagonal: float) -> np.ndarray:
@@ -133,10 +150,10 @@ def _dense(matrix, room: int, diagonal: float) -> np.ndarray:
 
 def _pair(mass, stiff, tentative, room: int, coarse: int, width, on):
     """A level, and M and A on the next one."""
-    below, beside = divisor(stiff), divisor(mass)
+    below, beside = aggregation.divisor(stiff), aggregation.divisor(mass)
     inverse = np.divide(1, below, out=np.zeros_like(below), where=below != 0)
-    radius = jacobi_radius(stiff, inverse, on)
-    prolong = smoothed(stiff, tentative, inverse, radius)
+    radius = aggregation.jacobi_radius(stiff, inverse, on)
+    prolong = aggregation.smoothed(stiff, tentative, inverse, radius)
     restrict = prolong.T.tocsr()
     # In one complex matrix both get one layout.
     both = (mass + 1j * stiff).tocsr()
@@ -149,9 +166,36 @@ def _pair(mass, stiff, tentative, room: int, coarse: int, width, on):
         pad(both.imag),
         pad(turned.real),
         pad(turned.imag),
-        filled(beside.astype(single), room, 1),
-        filled(below.astype(single), room),
-        *transfers(padded, restrict, prolong, coarse),
-        jnp.asarray(max(radius, jacobi_radius(mass, 1 / beside)), single),
+        aggregation.filled(beside.astype(single), room, 1),
+        aggregation.filled(below.astype(single), room),
+        *aggregation.transfers(padded, restrict, prolong, coarse),
+        jnp.asarray(max(radius, aggregation.jacobi_radius(mass, 1 / beside)), single),
     )
-    return pair, (restrict @ (mass @ prolong)).tocsr(), (restrict @ (stiff @ prolong)).tocsr()
+    coarser = ((restrict @ (a @ prolong)).tocsr() for a in (mass, stiff))
+    return pair, prolong, *coarser
+
+
+@sized_jit
+def _renewed(plan, operator, conditions) -> ShiftedMultigrid:
+    stiff, restriction = free_operator(operator, conditions)
+    below, free = renewal.free_divisor(operator, stiff, restriction)
+    matrices = stiff, lambda x: x
+    found, (stiff, mass), _ = renewal.renewed_levels(plan, matrices, below, free, operator.active)
+    pairs = []
+    for depth, v in enumerate(found):
+        (stiff_here, mass_here), (stiff_turned, mass_turned) = v.matrices, v.turned
+        beside, radius = jnp.ones_like(v.divisor), jnp.ones(())
+        if depth == 0:
+            mass_here = None
+        else:
+            size = renewal.divisor_of(mass_here)
+            radius = renewal.radius_of(mass_here, renewal.inverted(size), size != 0)
+            beside = jnp.where(size == 0, 1, size)
+        diagonals, transfers = (beside, v.divisor), (v.restrict, v.prolong)
+        radius = jnp.maximum(v.radius, radius)
+        pairs.append(
+            _Pair(mass_here, stiff_here, mass_turned, stiff_turned, *diagonals, *transfers, radius)
+        )
+    # The unknowns that fill it up have the equation x = 0.
+    mass = mass + jnp.diag(jnp.where(jnp.diagonal(mass) == 0, 1, 0))
+    return renewal.narrowed(ShiftedMultigrid(tuple(pairs), mass, stiff), np.dtype(np.float32))

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..arguments import as_float, count_on, finite, switched_off, whole
 from ..boundary import Closure
-from ..compiling import sized_jit
+from ..compiling import at_once, sized_jit
 from ..failures import is_concrete, needs_values, refuse, without_derivatives
 from ..stencils.algebra import AbstractOperator
 from ..stencils.lineax import Action
@@ -63,7 +63,7 @@ def solve(
         conditions: from `js.close` or `js.with_ghosts`.
         preconditioner: `js.multigrid(operator, conditions=conditions)` if None, also under
             `grad`; under `jit` and `vmap`, where values are not known, make it outside and pass
-            it. Or `js.jacobi(operator)`.
+            it, `renewed` inside where the operator is another. Or `js.jacobi(operator)`.
         solver: a solver of lineax; `js.BiCGStab(rtol, atol, max_steps)` if None.
         mean_zero: whether A annihilates the constants; seen from the preconditioner or a
             concrete operator if None.
@@ -216,10 +216,11 @@ def _check(operator, rhs, conditions) -> None:
         raise ValueError(
             f"right-hand side has shape {rhs.shape}: no column, one at least is needed"
         )
-    if conditions is None:
-        finite(rhs, "right-hand side")
-    elif is_concrete(rhs, conditions):
-        finite(conditions(rhs), "right-hand side or condition")
+    if is_concrete(rhs, conditions):
+        with at_once():  # constants, while the operator is traced
+            values = rhs if conditions is None else conditions(rhs)
+        named = "right-hand side" if conditions is None else "right-hand side or condition"
+        finite(values, named)
 
 
 def _raise_on_failure(solution, dtype, rtol, atol) -> None:

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float
 
-from ..arguments import as_many, instance, real
+from ..arguments import instance, real
 from ..boundary import Closure, Restriction, check_border
-from ..stencils.algebra import AbstractOperator, Composition, check_scalar
+from ..stencils.algebra import AbstractOperator, Composition
 from ..stencils.stencil import Stencil
 from .precondition import AbstractPreconditioner
+from .reduced import check_kinds, free_operator
 
 
 class System(eqx.Module):
@@ -45,10 +46,7 @@ class System(eqx.Module):
     @property
     def reduced(self) -> AbstractOperator:
         """P A E."""
-        operator = self.operator
-        if self.conditions is not None:
-            operator = operator @ self.conditions.extension
-        return operator if self._all_free else self.restriction @ operator
+        return free_operator(self.operator, self.conditions)[0]
 
     @property
     def matrix(self) -> AbstractOperator:
@@ -133,12 +131,7 @@ class Averaging(AbstractOperator):
 
 def check_system(operator, conditions, preconditioner, solver, atol) -> None:
     """Refuse what is not of the kinds that a problem consists of."""
-    instance(operator, AbstractOperator, "operator", "js.laplace_beltrami(cloud) makes one")
-    check_scalar(operator)
-    if conditions is not None:
-        hint = "js.close(cloud, conditions) makes one of conditions"
-        instance(conditions, Closure, "conditions", hint)
-        as_many("conditions", conditions.n, "the operator", operator.n)
+    check_kinds(operator, conditions)
     if preconditioner is not None:
         hint = "js.multigrid(operator) makes one"
         instance(preconditioner, AbstractPreconditioner, "preconditioner", hint)

@@ -117,7 +117,7 @@ def _sum_slots_jvp(contracted, primals, tangents):
 
 def constant_product(weights, indices, x):
     """The product of a scalar operator that is a constant for derivatives, quick to compile."""
-    if weights.size < _SMALL:
+    if weights.size < _SMALL and x.ndim == 1:
         return jnp.sum(weights * take(x, indices), axis=0)
     return _scan_slots(weights, indices, x, 0)
 

@@ -151,9 +151,10 @@ class PaddedMatrix(eqx.Module):
         extra = self.extra[2] - factor * other.extra[2]
         return PaddedMatrix(self.indices, weights, (*self.extra[:2], extra))
 
-    def __call__(self, x: Float[Array, " p"]) -> Float[Array, " m"]:
+    def __call__(self, x: Float[Array, "p *c"]) -> Float[Array, "m *c"]:
         rows, columns, values = self.extra
         total = constant_product(self.weights, self.indices, x)
+        values = values.reshape(-1, *[1] * (x.ndim - 1))
         return total.at[rows].add(values * take(x, columns))
 
 

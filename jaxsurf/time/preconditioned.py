@@ -7,13 +7,13 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float
 
 from ..arguments import instance
 from ..solve.precondition import Multigrid
 from ..solve.shifted import ShiftedMultigrid, shifted_multigrid
+from ..stencils.algebra import AbstractOperator
 from ..stencils.lineax import Square, matrix_free
 from .pde import AbstractEvolution, AdvectionDiffusionReaction, BiharmonicDiffusion, CahnHilliard
 
@@ -40,6 +40,19 @@ class StepPreconditioner(eqx.Module):
             for row in shifts
         ]
         return StepInverse(cycles, jax.ShapeDtypeStruct(self.shape, g.dtype))
+
+    def renewed(self, problem: AbstractEvolution) -> StepPreconditioner:
+        """That of another problem on the same points: same aggregates, other numbers.
+
+        Runs under `jit`, `vmap` and `grad`, see `Multigrid.renewed`. A constant for derivatives.
+
+        Raises:
+            TypeError: no problem.
+            ValueError: made without `renewable=True`; a problem that has none, or of another size.
+        """
+        laplacian, shifts = _factors(problem, self.shape)
+        hierarchy = self.hierarchy.renewed(laplacian, conditions=problem.conditions)
+        return StepPreconditioner(hierarchy, shifts, self.shape)
 
 
 @matrix_free
@@ -74,7 +87,9 @@ class StepInverse(Square):
         return self.structure
 
 
-def step_preconditioner(problem: AbstractEvolution, u0: Float[Array, "n *c"]) -> StepPreconditioner:
+def step_preconditioner(
+    problem: AbstractEvolution, u0: Float[Array, "n *c"], *, renewable: bool = False
+) -> StepPreconditioner:
     r"""Multigrid for `IMEX(preconditioner=...)`, for steps of any length.
 
     Without it the linear systems take a number of Krylov steps that grows like $\sqrt{\Delta t}
@@ -85,6 +100,8 @@ def step_preconditioner(problem: AbstractEvolution, u0: Float[Array, "n *c"]) ->
         problem: `AdvectionDiffusionReaction`, `BiharmonicDiffusion` or `CahnHilliard`, with
             concrete arrays. A diffusivity in space counts with its mean, one in time as at t = 0.
         u0: a state, for its shape.
+        renewable: keep what `renewed(problem)`, a method of the result, needs to serve other
+            operators in compiled code.
 
     Returns:
         A function of g, for traced g too; a constant for derivatives.
@@ -102,13 +119,23 @@ def step_preconditioner(problem: AbstractEvolution, u0: Float[Array, "n *c"]) ->
         >>> bool(jnp.abs(u - jnp.exp(-0.4) * u0).max() < 0.01)
         True
     """
+    laplacian, shifts = _factors(problem, getattr(u0, "shape", ()))
+    if not hasattr(u0, "shape") or u0.ndim not in (1, 2) or u0.shape[0] != laplacian.n:
+        shape = u0.shape if hasattr(u0, "shape") else type(u0).__name__
+        raise ValueError(f"u0 is {shape}, expected an array ({laplacian.n},) or ({laplacian.n}, c)")
+    hierarchy = shifted_multigrid(laplacian, conditions=problem.conditions, renewable=renewable)
+    return StepPreconditioner(hierarchy, shifts, jnp.shape(u0))
+
+
+def _factors(problem, shape: tuple[int, ...]) -> tuple[AbstractOperator, Partial]:
+    """The Laplacian of a problem, and the function of g to the shifts."""
     hint = "like AdvectionDiffusionReaction(laplacian)"
     instance(problem, AbstractEvolution, "problem", hint)
     laplacian = getattr(problem, "laplacian", None)
     if isinstance(problem, AdvectionDiffusionReaction) and laplacian is not None:
         d = problem.diffusivity
         d = d(0.0) if callable(d) else d
-        shifts = Partial(_diffusive, _mean(d, jnp.shape(u0)[1:], problem.active))
+        shifts = Partial(_diffusive, _mean(d, shape[1:], problem.active))
     elif isinstance(problem, BiharmonicDiffusion):
         shifts = Partial(_biharmonic, jnp.asarray(problem.stiffness))
     elif isinstance(problem, CahnHilliard):
@@ -120,21 +147,18 @@ def step_preconditioner(problem: AbstractEvolution, u0: Float[Array, "n *c"]) ->
             f"there is no preconditioner for problem = {kind}: it has no diffusion, or none known"
         )
     assert laplacian is not None
-    if not hasattr(u0, "shape") or u0.ndim not in (1, 2) or u0.shape[0] != laplacian.n:
-        shape = u0.shape if hasattr(u0, "shape") else type(u0).__name__
-        raise ValueError(f"u0 is {shape}, expected an array ({laplacian.n},) or ({laplacian.n}, c)")
-    hierarchy = shifted_multigrid(laplacian, conditions=problem.conditions)
-    return StepPreconditioner(hierarchy, shifts, jnp.shape(u0))
+    return laplacian, shifts
 
 
 def _mean(diffusivity, species: tuple[int, ...], on) -> Array:
     """Over the points that are on: a number, or one for every species."""
     d = jnp.asarray(diffusivity)
+    per_species = bool(species) and d.shape[-1:] == species
+    d = d.reshape(-1, *species) if per_species else d
+    counted = None
     if on is not None and d.shape[:1] == on.shape:
-        d = d[np.asarray(on)]
-    if species and d.shape[-1:] == species:
-        return jnp.mean(d.reshape(-1, *species), axis=0)
-    return jnp.mean(d)
+        counted = on.reshape(-1, *[1] * (d.ndim - 1))
+    return jnp.mean(d, axis=0 if per_species else None, where=counted)
 
 
 def _diffusive(diffusivity, g):

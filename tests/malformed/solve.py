@@ -27,6 +27,10 @@ def z():
     return problem()[0].points[:, 2]
 
 
+def renewable():
+    return js.multigrid(laplacian(), renewable=True)
+
+
 def pinned():
     return js.close(problem()[0], js.dirichlet([0], 0.0))
 
@@ -207,6 +211,17 @@ CASES = [
          ("Composition",)),
     Case("multigrid", "NaN weights", lambda: js.multigrid(js.Stencil(
         laplacian().indices, laplacian().weights.at[2, 17].set(jnp.nan))), ("point 17",)),
+    *[
+        Case("multigrid", f"renewed for {label}", call, words)
+        for label, call, words in (
+            ("what has no plan", lambda: js.multigrid(laplacian()).renewed(laplacian()),
+             ("renewable=True",)),
+            ("no operator", lambda: renewable().renewed(jnp.eye(60)), ("operator", "array")),
+            ("fewer points", lambda: renewable().renewed(js.identity(40)), ("40", "60")),
+            ("a Condition", lambda: renewable().renewed(
+                laplacian(), conditions=js.dirichlet([0], 0.0)), ("conditions", "Closure")),
+        )
+    ],
     Case("multigrid", "a zero row", lambda: js.multigrid(js.Stencil(
         laplacian().indices, laplacian().weights.at[:, 5].set(0.0))), ("row 5",)),
 ]  # fmt: skip

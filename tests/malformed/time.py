@@ -315,6 +315,10 @@ REST = [
          "u0", "list"),
     case("step_preconditioner", "u0 of other length", lambda: js.step_preconditioner(heat(), U[:3]),
          "u0", "(3,)", "(12,)"),
+    case("step_preconditioner", "renewed for what has no plan", lambda: js.step_preconditioner(
+         heat(), U).renewed(heat()), "renewable=True"),
+    case("step_preconditioner", "renewed for an operator", lambda: js.step_preconditioner(
+         heat(), U, renewable=True).renewed(laplacian()), "problem", "Stencil"),
     case("step_preconditioner", "problem None", lambda: js.step_preconditioner(None, U),
          "problem", "None"),
 ] + [

@@ -91,13 +91,14 @@ TESTED = {
     "multigrid": {
         "value": "test_precondition.py::test_one_cycle_damps_every_error",
         "gradient": "(not differentiated: derivatives of solve are implicit)",
-        "jit": "(host only: concrete arrays)",
-        "vmap": "(host only: concrete arrays)",
+        "jit": "test_renewal.py::test_steps_are_those_of_a_hierarchy_made_anew",
+        "vmap": "test_renewal.py::test_vmap_over_weights",
         "float32": "test_precondition.py::test_cycle_is_linear_and_its_transpose_exact",
         "bad input": "malformed",
     },
     "Multigrid": {
-        "value": "test_precondition.py::test_cycle_is_linear_and_its_transpose_exact",
+        "value": "test_precondition.py::test_cycle_is_linear_and_its_transpose_exact, "
+        "test_renewal.py::test_at_the_same_weights_the_numbers_are_those_of_the_host",
         "gradient": "(not differentiated: derivatives of solve are implicit)",
         "jit": "test_precondition.py::test_cycle_under_transformations",
         "vmap": "test_precondition.py::test_cycle_under_transformations",

@@ -129,7 +129,8 @@ TESTED: dict[str, dict[str, Entry]] = {
         "bad input": "malformed",
     },
     "step_preconditioner": {
-        "value": "test_shifted.py::test_steps_and_gradients_are_the_same_with_it",
+        "value": "test_shifted.py::test_steps_and_gradients_are_the_same_with_it, "
+        "test_renewal.py::test_implicit_steps_on_another_surface",
         "gradient": "test_shifted.py::test_steps_and_gradients_are_the_same_with_it",
         "jit": _INVERSES,
         "vmap": _INVERSES,

@@ -188,8 +188,8 @@ def _free_neighbors(cloud, rows, free, neighbors, method) -> Rows:
         if neighbors.radius is not None:
             radius = jnp.broadcast_to(neighbors.radius, cloud.n)
     count = mask.sum(axis=1)
-    text = f"point {{i}} has {{v}} free neighbours, {method} needs at least {need - 1} besides it"
-    raise_at(count < need, text, count - 1, points=rows)
+    text = f"point {{i}} has {{v}} free neighbours, {method} needs at least {need - 1} besides "
+    raise_at(count < need, f"{text}the point itself", count - 1, points=rows)
     indices = np.where(mask, indices, indices[:, 1:2])
     return Rows(jnp.asarray(indices), jnp.asarray(mask), radius)
 

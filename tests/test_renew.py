@@ -176,12 +176,10 @@ def test_what_has_no_room_or_is_out_of_reach_has_a_code():
     turned = jnp.where(cloud.points[:, :1] > 0, 1, -1) * normals
     assert (code(call(folded, turned)) == 2).any()
     assert code(call(cloud.points.at[3].set(jnp.nan), normals))[3] == 1
-    # Adapted neighbourhoods that the lists are too short for.
+    # Adapted neighbourhoods that the lists are too short for; 122 slots serve: `test_mapped`.
     rough = random_sphere(600)
     narrow = js.discretize(rough, js.find_neighbors(rough, 36), method=METHOD)
-    tight, wide = (narrow.search(margin=2, slots=s) for s in (36, 122))
-    assert (found(narrow, rough, tight)[2] == 5).any()
-    assert not found(narrow, rough, wide)[2].any()
+    assert (found(narrow, rough, narrow.search(margin=2, slots=36))[2] == 5).any()
 
 
 def test_kept_lists_reach_as_long_as_the_surface_is_not_stretched_one_way():

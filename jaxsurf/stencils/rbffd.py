@@ -11,14 +11,7 @@ import jax.numpy as jnp
 from ..arguments import whole
 from ..fits.monomials import monomials, polynomial_count
 from ..frames import tangent_frames
-from .method import (
-    AbstractMethod,
-    Diagnostics,
-    Neighborhood,
-    check_positive,
-    needed_polynomials,
-    with_center,
-)
+from .method import AbstractMethod, Diagnostics, Neighborhood, needed_polynomials, with_center
 from .targets import AbstractTarget
 
 
@@ -32,27 +25,27 @@ class RBFFD(AbstractMethod):
     Args:
         degree: polynomial degree p; gradients then converge like $h^p$ and the Laplacian like
             $h^{p-1}$, or $h^p$ for even p on even points.
-        exponent: power m of the distance, odd, from 3 to 2 p + 1.
+        exponent: power m of the distance, odd, from 3 to 2 p + 1; by default the least odd one
+            above p, at most 7: higher ones may be unstable on random points.
 
     Raises:
         ValueError: a degree below 1, an exponent that is even or out of range.
 
     Example:
         >>> cloud = js.sphere(500)
-        >>> z = cloud.points[:, 2]
         >>> operator = js.laplace_beltrami(cloud, method=js.RBFFD(degree=4))
-        >>> bool(jnp.abs(operator(z) + 2 * z).max() < 0.02)
+        >>> bool(jnp.abs(operator(cloud.points) + 2 * cloud.points).max() < 0.02)
         True
     """
 
     degree: int = eqx.field(static=True, default=2)
-    exponent: int = eqx.field(static=True, default=3, kw_only=True)
+    exponent: int | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self):
-        check_positive(self, degree=True)
-        most = 2 * self.degree + 1
-        if whole(self.exponent, "RBFFD: exponent", least=3, most=most) % 2 == 0:
-            raise ValueError(f"RBFFD: exponent = {self.exponent}, expected an odd number")
+        most = 2 * whole(self.degree, "RBFFD: degree", least=1) + 1
+        if self.exponent is not None:
+            if whole(self.exponent, "RBFFD: exponent", least=3, most=most) % 2 == 0:
+                raise ValueError(f"RBFFD: exponent = {self.exponent}, expected an odd number")
 
     def neighbor_count(self, dim):
         return 2 * polynomial_count(dim - 1, self.degree) + 1
@@ -60,6 +53,7 @@ class RBFFD(AbstractMethod):
     def basis_size(self, dim, target):
         return needed_polynomials(self.degree, dim, target)
 
+    power = property(lambda self: self.exponent or min(self.degree + 1 + self.degree % 2, 7))
     batch_size = property(lambda self: 64)
     polynomial_degree = property(lambda self: max(self.degree, 2))
     shares_moments = property(lambda self: True)
@@ -84,7 +78,7 @@ class RBFFD(AbstractMethod):
 
 def _matrix(x, on, method):
     """Of coordinates `(t, *p, k)`; slots that are off have rows of the identity."""
-    phi = _power(sum((c[..., None] - c[..., None, :]) ** 2 for c in x), method.exponent)
+    phi = _power(sum((c[..., None] - c[..., None, :]) ** 2 for c in x), method.power)
     phi = jnp.where(on[..., None] & on[..., None, :], phi, jnp.eye(x.shape[-1], dtype=x.dtype))
     p = jnp.where(on, monomials(x, method.degree), 0)
     zero = jnp.zeros((*on.shape[:-1], len(p), len(p)), x.dtype)
@@ -93,7 +87,7 @@ def _matrix(x, on, method):
 
 def _right_hand_side(x, on, method, target):
     """Targets of all |x - x_j|^m, by their Taylor coefficients at 0, and of all monomials."""
-    m, square = method.exponent, jnp.sum(x**2, axis=0)
+    m, square = method.power, jnp.sum(x**2, axis=0)
     value, first, second = (_power(square, m - less) for less in (0, 2, 4))
     taylor = [value, *(-m * first * c for c in x)]
     for a, b in itertools.combinations_with_replacement(x, 2):

@@ -9,6 +9,7 @@ import pytest
 
 import jaxsurf as js
 
+pytestmark = pytest.mark.slow
 CLOUD = js.sphere(200)
 SURFACE = js.discretize(CLOUD, method=js.GFDM(degree=2))
 Z = CLOUD.points[:, 2]
@@ -64,7 +65,7 @@ def exact(eigenvalue, t=END, a=GROWTH):
     ids=lambda solver: type(solver).__name__,
 )
 def test_heat_on_a_growing_sphere(solver):
-    """To what steps of second order leave; the Laplacian is homogeneous in lengths, of degree -2."""
+    """To what steps leave; the Laplacian goes like 1 / length²."""
     points, u = end(GROWTH, solver)
     assert float(jnp.abs(points - np.exp(GROWTH * END) * CLOUD.points).max()) < 1e-3
     factor = float(jnp.vdot(Z, u) / jnp.vdot(Z, Z))
@@ -72,3 +73,37 @@ def test_heat_on_a_growing_sphere(solver):
     assert abs(eigenvalue + 2) < 0.1
     assert abs(factor / exact(eigenvalue) - 1) < 2e-3
     assert abs(factor / exact(-2) - 1) < 1e-2
+
+
+def test_gradient_in_the_growth():
+    """Through the geometry, against central differences."""
+    value = jax.jit(lambda a: jnp.sum((y := end(a, dfx.Heun(), 2))[1] ** 2 * y[0][:, 2] ** 2))
+    step = 1e-4
+    difference = (value(GROWTH + step) - value(GROWTH - step)) / (2 * step)
+    assert abs(float(jax.grad(value)(GROWTH) / difference) - 1) < 1e-6
+
+
+@pytest.mark.core
+def test_a_problem_of_ones_own_is_preconditioned():
+    """The cycles invert 1 - g L at the geometry of the state, and leave the points alone."""
+    problem, state = grown(), (CLOUD.points, jnp.exp(Z))
+    assert js.choose_solver(problem)[1].endswith("by its author")
+    g = 0.5
+    inverse = js.step_preconditioner(problem, state)(g)
+    frozen = problem.at(0.0, state)
+    left = jax.tree.map(lambda y, k: y - g * k, state, frozen.linear(0.0, state))
+    points, u = inverse.mv(left)
+    assert bool(jnp.all(points == CLOUD.points))
+    assert float(jnp.linalg.norm(u - state[1]) / jnp.linalg.norm(state[1])) < 0.1
+    transposed = inverse.transpose()
+    a, b = jnp.sin(3 * Z), jnp.cos(2 * CLOUD.points[:, 0])
+    zero = 0 * CLOUD.points
+    one, other = jnp.vdot(a, inverse.mv((zero, b))[1]), jnp.vdot(transposed.mv((zero, a))[1], b)
+    assert abs(float(one - other)) < 1e-10 * abs(float(one))
+
+
+@pytest.mark.core
+def test_what_was_passed_stays_readable():
+    turn = jnp.cross(jnp.array([0.0, 0.0, 1.0]), CLOUD.points)
+    problem = js.AdvectionDiffusionReaction(gradient=SURFACE.gradient, velocity=turn)
+    assert bool(jnp.all(problem.velocity == turn)) and problem.gradient is SURFACE.gradient

@@ -8,7 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ..arguments import as_float, instance
 from ..functions import canonical
@@ -84,7 +84,7 @@ def _through(cycles: list[Multigrid | list[Multigrid]], field: Array) -> Array:
     return field
 
 
-def step_preconditioner(problem: AbstractEvolution, u0: Float[Array, "n *c"]) -> StepPreconditioner:
+def step_preconditioner(problem: AbstractEvolution, u0: PyTree[Array]) -> StepPreconditioner:
     r"""Multigrid for `IMEX(preconditioner=...)`, for steps of any length.
 
     Without it the linear systems take a number of Krylov steps that grows like $\sqrt{\Delta t}

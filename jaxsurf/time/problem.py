@@ -141,7 +141,7 @@ class AbstractEvolution(eqx.Module):
         now = self.at(t, u)
         return now._free(_add(now.linear(t, u), now.rest(t, u, args)))
 
-    def implicit_rate(self, t, u: PyTree[Array]) -> PyTree[Array]:
+    def implicit_rate(self, t, u: PyTree[Array], args) -> PyTree[Array]:
         """The part for implicit steps, linear in u: P L E u."""
         within = jax.tree.map(lambda v: homogeneous(self.conditions, v), u)
         return self._free(self.linear(t, within))

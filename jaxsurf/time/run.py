@@ -206,7 +206,7 @@ def _terms(problem: AbstractEvolution, solver: dfx.AbstractSolver, now):
     if not _takes_two(solver):
         return dfx.ODETerm(canonical(checked_rate(problem.rate), *now))
     if type(problem).at is AbstractEvolution.at:
-        parts = (problem.explicit_rate, lambda t, u, args: problem.implicit_rate(t, u))
+        parts = (problem.explicit_rate, problem.implicit_rate)
         return dfx.MultiTerm(*(dfx.ODETerm(canonical(checked_rate(part), *now)) for part in parts))
     linear = _linear_part(problem, now)
     whole = canonical(checked_rate(problem.rate), *now)
@@ -224,7 +224,7 @@ def _linear_part(problem: AbstractEvolution, now) -> Linear:
         return arrays
 
     def apply(t, u, arrays):
-        return eqx.combine(arrays, fixed[0]).implicit_rate(t, u)
+        return eqx.combine(arrays, fixed[0]).implicit_rate(t, u, None)
 
     first = canonical(freeze, t, u)
     shapes = jax.eval_shape(first, t, u)

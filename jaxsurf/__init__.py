@@ -92,19 +92,19 @@ from .stencils.rbffd import RBFFD as RBFFD
 from .stencils.stencil import Stencil as Stencil
 from .time.checkpoint import Checkpoint as Checkpoint
 from .time.explicit import RKC2 as RKC2
+from .time.higher import BiharmonicDiffusion as BiharmonicDiffusion
+from .time.higher import CahnHilliard as CahnHilliard
+from .time.higher import WaveEquation as WaveEquation
 from .time.implicit import IMEX as IMEX
 from .time.implicit import SDIRK as SDIRK
 from .time.integrate import IntegrationError as IntegrationError
 from .time.integrate import integrate as integrate
 from .time.integrate import steady_state as steady_state
-from .time.pde import AbstractEvolution as AbstractEvolution
-from .time.pde import AdvectionDiffusionReaction as AdvectionDiffusionReaction
-from .time.pde import BiharmonicDiffusion as BiharmonicDiffusion
-from .time.pde import CahnHilliard as CahnHilliard
-from .time.pde import WaveEquation as WaveEquation
 from .time.preconditioned import step_preconditioner as step_preconditioner
+from .time.problem import AbstractEvolution as AbstractEvolution
 from .time.run import choose_solver as choose_solver
 from .time.stabilize import hyperviscosity as hyperviscosity
 from .time.stabilize import upwinding as upwinding
+from .time.transport import AdvectionDiffusionReaction as AdvectionDiffusionReaction
 
 __version__ = "0.1.0"

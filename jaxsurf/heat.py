@@ -17,7 +17,7 @@ from .neighbors import Neighbors
 from .stencils.stencil import Stencil
 from .time.explicit import RKC2
 from .time.integrate import integrate
-from .time.pde import AdvectionDiffusionReaction
+from .time.transport import AdvectionDiffusionReaction
 
 
 def cell_areas(cloud: PointCloud, neighbors: Neighbors, *, rays: int = 120) -> Float[Array, " n"]:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import jaxsurf as js
-from jaxsurf.time.implicit import _IMEX, _SDIRK, _relative
+from jaxsurf.time.implicit import _IMEX, _SDIRK
+from jaxsurf.time.relative import relative
 
 from .helpers import ring
 
@@ -251,7 +252,7 @@ def test_systems_with_a_simple_answer_are_solved(field):
     operator = lx.FunctionLinearOperator(
         lambda u: u - 0.1 * LAPLACIAN(u), jax.eval_shape(lambda: X)
     )
-    found = lx.linear_solve(operator, right, _relative(None, None, right), throw=False)
+    found = lx.linear_solve(operator, right, relative(None, None, right), throw=False)
     assert found.result == lx.RESULTS.successful
     np.testing.assert_allclose(operator.mv(found.value), right, atol=1e-8)
 

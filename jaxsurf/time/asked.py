@@ -15,8 +15,8 @@ from jaxtyping import Array, PyTree
 from ..arguments import as_float, is_concrete, raise_at, real
 from ..boundary import check_border
 from ..stencils.algebra import AbstractOperator
-from .coefficients import user
-from .pde import AbstractEvolution, AdvectionDiffusionReaction, WaveEquation
+from .higher import WaveEquation
+from .problem import AbstractEvolution
 from .states import dtype_of, only_on
 
 
@@ -28,7 +28,7 @@ def checked_state(problem: AbstractEvolution, u0: Any) -> PyTree[Array]:
         ValueError: another number of points than the operators have, entries that are not finite.
     """
     pair = isinstance(problem, WaveEquation)
-    n = _points(problem)
+    n = problem.n
     size = "n" if n is None else n
     want = f"a pair of arrays ({size}, ...)" if pair else f"an array ({size}, ...)"
     if isinstance(u0, list) or u0 is None:
@@ -55,16 +55,6 @@ def checked_state(problem: AbstractEvolution, u0: Any) -> PyTree[Array]:
     if len({leaf.dtype for leaf in leaves}) > 1:
         raise TypeError(f"u0 has entries of types {[str(leaf.dtype) for leaf in leaves]}, not one")
     return u0
-
-
-def _points(problem: AbstractEvolution) -> int | None:
-    """Number of points, if the problem is one of ours."""
-    if type(problem).__module__.startswith(__package__):
-        for name in ("laplacian", "advection", "gradient"):
-            operator = getattr(problem, name, None)
-            if isinstance(operator, AbstractOperator):
-                return operator.n
-    return None
 
 
 def checked_times(problem: AbstractEvolution, u0, t0, t1, dt0):
@@ -162,19 +152,9 @@ def check_coefficients(problem: AbstractEvolution, t0, t1) -> None:
     for name, operator in vars(problem).items():
         if isinstance(operator, AbstractOperator) and name != "stabilization":
             check_border(operator, problem.conditions)
-    if not isinstance(problem, AdvectionDiffusionReaction):
-        return
-    if callable(problem.diffusivity) and problem.laplacian is not None and is_concrete(t0, t1):
-        for t in (t0, t1):
-            values = (
-                np.asarray(d)
-                if is_concrete(d := user(problem.diffusivity, "diffusivity", t))
-                else np.zeros(())
-            )
-            if not (values >= 0).all():
-                raise ValueError(
-                    f"diffusivity is {values.min():g} at t = {float(t):g}, expected at least 0"
-                )
+    if is_concrete(t0, t1):
+        problem.check(t0)
+        problem.check(t1)
 
 
 def bad_rows(values: np.ndarray) -> np.ndarray:

@@ -16,6 +16,8 @@ from jaxtyping import Array, ArrayLike, PyTree
 from ..arguments import instance, real, whole
 from ..functions import numbers_as_arrays
 from .explicit import after_jump
+from .phases import frozen_at
+from .relative import relative, tolerance_of
 from .states import dtype_of, root_mean_square
 
 Preconditioner = Callable[[Any], lx.AbstractLinearOperator]
@@ -155,9 +157,10 @@ class IMEX(dfx.AbstractAdaptiveSolver):
         return tuple(term.vf(t0, y0, args) for term in terms.terms)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        terms, solver_state = frozen_at(terms, t0, y0, solver_state)
         implicit = terms.terms[1]
         span = implicit.contr(t0, t1)
-        solver = _relative(self.solver, self.tolerance, y0)
+        solver = relative(self.solver, self.tolerance, y0)
 
         tableau = _IMEX[self.scheme]
         options = _options(self.preconditioner, tableau.gamma * (t1 - t0))
@@ -246,7 +249,7 @@ class SDIRK(dfx.AbstractAdaptiveSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         span = terms.contr(t0, t1)
-        tolerance = _tolerance(self.tolerance, y0)
+        tolerance = tolerance_of(self.tolerance, y0)
 
         tableau = _SDIRK[self.scheme]
         options = _options(self.preconditioner, tableau.gamma * (t1 - t0))
@@ -256,8 +259,8 @@ class SDIRK(dfx.AbstractAdaptiveSolver):
                 change = terms.vf_prod(t, y, args, span)
                 return jax.tree.map(lambda y, k, r: y - tableau.gamma * k - r, y, change, known)
 
-            inner = _relative(self.solver, _FORCING, y0, partial=True)
-            outer = _relative(self.solver, self.tolerance, y0)
+            inner = relative(self.solver, _FORCING, y0, partial=True)
+            outer = relative(self.solver, self.tolerance, y0)
             structure = jax.eval_shape(lambda: y0)
 
             def newton(residual, start):
@@ -349,83 +352,6 @@ def _steps(tableau: Tableau, terms, solve, t0, t1, y0, args, rates, made_jump):
     rates = tuple(term.vf(t1, y1, args) for term in terms)
     k1 = _sum([term.prod(rate, s) for term, rate, s in zip(terms, rates, span)])
     return y1, error, dict(y0=y0, y1=y1, k0=_sum(first), k1=k1), rates, ok
-
-
-class _Relative(lx.AbstractLinearSolver):
-    """A linear solver whose tolerance is relative to the norm of the right-hand side.
-
-    Krylov solvers of lineax weigh the residual point by point with the right-hand side, which
-    may vanish somewhere; here it is brought to norm one. The residual is then computed afresh,
-    because the recursions of BiCGStab may lose it. Systems that are not solved give NaN: nobody
-    looks at the result codes of those that derivatives solve.
-
-    Args:
-        solver: does the work.
-        tolerance: largest residual.
-        partial: give what there is where a system is not solved.
-    """
-
-    solver: lx.AbstractLinearSolver
-    tolerance: Any
-    partial: bool = eqx.field(static=True, default=False)
-
-    def init(self, operator, options):
-        return self.solver.init(operator, options), operator
-
-    def compute(self, state, vector, options):
-        krylov, operator = state
-        norm = root_mean_square(vector)
-        scale = jnp.where(norm > 0, norm, 1)
-        unit = jax.tree.map(lambda v: v / scale, vector)
-        x, result, stats = self.solver.compute(krylov, unit, options)
-        missed = lambda image: root_mean_square(jax.tree.map(jnp.subtract, image, unit))
-        # Where a multiple of the right-hand side solves the system (zero, constants, eigenvectors),
-        # BiCGStab divides zero by zero.
-        image = operator.mv(unit)
-        inner = lambda a, b: sum(jnp.vdot(*pair) for pair in zip(*map(jax.tree.leaves, (a, b))))
-        length = inner(image, image)
-        factor = inner(unit, image) / jnp.where(length > 0, length, 1)
-        simple = missed(jax.tree.map(lambda a: factor * a, image)) <= self.tolerance
-        x = jax.tree.map(lambda x, u: jnp.where(simple, factor * u, x), x, unit)
-        good = missed(operator.mv(x)) <= 10 * self.tolerance
-        # Too many steps of this solver are not to be mistaken for too many steps in time.
-        mild = (result == lx.RESULTS.successful) | (result == lx.RESULTS.max_steps_reached)
-        result = lx.RESULTS.where(
-            good, lx.RESULTS.successful, lx.RESULTS.where(mild, lx.RESULTS.stagnation, result)
-        )
-        scale = jnp.where(good | self.partial, scale, jnp.nan)
-        return jax.tree.map(lambda x: scale * x, x), result, stats
-
-    def transpose(self, state, options):
-        inner, operator = state
-        inner, options = self.solver.transpose(inner, options)
-        return (inner, operator.transpose()), options
-
-    def conj(self, state, options):
-        inner, operator = state
-        inner, options = self.solver.conj(inner, options)
-        return (inner, lx.conj(operator)), options
-
-    def assume_full_rank(self):
-        return True
-
-
-def _relative(
-    solver: lx.AbstractLinearSolver | None, tolerance, y: PyTree[Array], partial: bool = False
-) -> _Relative:
-    tolerance = _tolerance(tolerance, y)
-    if solver is None:
-        kind = lx.BiCGStab if dtype_of(y) == jnp.float64 else lx.GMRES
-        solver = kind(rtol=0.0, atol=tolerance, norm=root_mean_square, max_steps=_KRYLOV_STEPS)
-    return _Relative(solver, tolerance, partial)
-
-
-# A system that needs more Krylov steps than this wants a preconditioner or a shorter step.
-_KRYLOV_STEPS = 500
-
-
-def _tolerance(tolerance, y: PyTree[Array]):
-    return float(jnp.finfo(dtype_of(y)).eps) ** 0.6 if tolerance is None else tolerance
 
 
 def _combined(y: PyTree[Array], weights: Array, increments: PyTree[Array]) -> PyTree[Array]:

@@ -17,8 +17,8 @@ from ..arguments import instance, raise_at, real
 from ..functions import numbers_as_arrays
 from .asked import bad_rows
 from .checkpoint import Checkpoint, integrate_in_parts
-from .pde import AbstractEvolution
-from .run import UNDAMPED, Plan, Run, planned, solve, undamped
+from .problem import AbstractEvolution
+from .run import Plan, Run, planned, solve
 from .stability import Verdict
 from .states import root_mean_square
 
@@ -132,8 +132,8 @@ def integrate(
         problem, u0, t0, t1, solver, dt0, rtol, atol, controller, saveat, event, adjoint, args,
         max_steps, progress and checkpoint is None, throw,
     )  # fmt: skip
-    if undamped(problem) and plan.concrete:
-        warnings.warn(UNDAMPED, stacklevel=2)
+    if problem.caution and plan.concrete:
+        warnings.warn(problem.caution, stacklevel=2)
     if checkpoint is None:
         return _finished(plan, plan.run, throw)
     part = lambda run: _finished(plan, run, throw)

@@ -3,19 +3,20 @@ r"""Multigrid for the linear systems of implicit steps."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.tree_util import Partial
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ..arguments import instance
+from ..arguments import as_float, instance
+from ..functions import canonical
 from ..solve.precondition import Multigrid
 from ..solve.shifted import ShiftedMultigrid, shifted_multigrid
-from ..stencils.algebra import AbstractOperator
 from ..stencils.lineax import Square, matrix_free
-from .pde import AbstractEvolution, AdvectionDiffusionReaction, BiharmonicDiffusion, CahnHilliard
+from .problem import AbstractEvolution
+from .states import dtype_of
 
 
 class StepPreconditioner(eqx.Module):
@@ -23,36 +24,45 @@ class StepPreconditioner(eqx.Module):
 
     Args:
         hierarchy: of the Laplacian.
-        shifts: function of g to the $s_i$ of $1 - g L \approx \prod_i (1 - s_i \Delta)$, `(m,)`
-            or `(m, c)` for c species of their own.
-        shape: of the field.
+        factors: function of g, see `AbstractEvolution.factors`.
+        shapes: of the arrays of the state.
+        structure: of the state.
     """
 
     hierarchy: ShiftedMultigrid
-    shifts: Callable[[Array], Float[Array, "m *c"]]
-    shape: tuple[int, ...] = eqx.field(static=True)
+    factors: Callable
+    shapes: tuple[jax.ShapeDtypeStruct, ...] = eqx.field(static=True)
+    structure: Any = eqx.field(static=True)
 
     def __call__(self, g: ArrayLike) -> StepInverse:
-        g = jnp.asarray(g)
-        shifts = jax.lax.stop_gradient(self.shifts(g))
-        cycles = [
-            jax.tree.map(self.hierarchy.at, list(row)) if row.ndim else self.hierarchy.at(row)
-            for row in shifts
-        ]
-        return StepInverse(cycles, jax.ShapeDtypeStruct(self.shape, g.dtype))
+        factors = jax.lax.stop_gradient(self.factors(jnp.asarray(g, self.shapes[0].dtype)))
+        cycles = [self._cycles(rows) for rows in self.structure.flatten_up_to(factors)]
+        return StepInverse(cycles, self.shapes, self.structure)
 
-    def renewed(self, problem: AbstractEvolution) -> StepPreconditioner:
+    def _cycles(self, rows: Float[Array, "m *c"] | None) -> list:
+        at = lambda row: [self.hierarchy.at(s) for s in row] if row.ndim else self.hierarchy.at(row)
+        return [] if rows is None else [at(row) for row in rows]
+
+    def renewed(
+        self, problem: AbstractEvolution, u0: PyTree[Array] | None = None
+    ) -> StepPreconditioner:
         """That of another problem on the same points: same aggregates, other numbers.
 
         Runs under `jit`, `vmap` and `grad`, see `Multigrid.renewed`. A constant for derivatives.
+
+        Args:
+            problem: of the kind that this was made for.
+            u0: a state, where geometry is part of it.
 
         Raises:
             TypeError: no problem.
             ValueError: made without `renewable=True`; a problem that has none, or of another size.
         """
-        laplacian, shifts = _factors(problem, self.shape)
-        hierarchy = self.hierarchy.renewed(laplacian, conditions=problem.conditions)
-        return StepPreconditioner(hierarchy, shifts, self.shape)
+        if u0 is None:
+            u0 = self.structure.unflatten(jnp.zeros(x.shape, x.dtype) for x in self.shapes)
+        now, _, factors = _factored(problem, u0)
+        hierarchy = self.hierarchy.renewed(now.laplacian, conditions=now.conditions)
+        return StepPreconditioner(hierarchy, factors, self.shapes, self.structure)
 
 
 @matrix_free
@@ -60,35 +70,43 @@ class StepInverse(Square):
     """One cycle after another.
 
     Args:
-        cycles: each for all columns of a field, or a list with one for every column.
-        structure: of the field.
+        cycles: for each array of the state, one after another: each for all columns, or a list
+            with one for every column.
+        shapes: of the arrays of the state.
+        structure: of the state.
     """
 
-    cycles: list[Multigrid | list[Multigrid]]
-    structure: jax.ShapeDtypeStruct = eqx.field(static=True)
+    cycles: list[list[Multigrid | list[Multigrid]]]
+    shapes: tuple[jax.ShapeDtypeStruct, ...] = eqx.field(static=True)
+    structure: Any = eqx.field(static=True)
 
     def mv(self, vector):
-        for cycle in self.cycles:
-            if isinstance(cycle, list):
-                columns = [one(v) for one, v in zip(cycle, vector.T)]
-                vector = jnp.stack(columns, axis=1)
-            else:
-                vector = cycle(vector) if vector.ndim == 1 else jax.vmap(cycle, 1, 1)(vector)
-        return vector
+        fields = self.structure.flatten_up_to(vector)
+        return self.structure.unflatten(map(_through, self.cycles, fields))
 
     def transpose(self):
-        turned = [
+        turn = lambda cycle: (
             [one.transpose() for one in cycle] if isinstance(cycle, list) else cycle.transpose()
-            for cycle in reversed(self.cycles)
-        ]
-        return StepInverse(turned, self.structure)
+        )
+        turned = [[turn(cycle) for cycle in reversed(cycles)] for cycles in self.cycles]
+        return StepInverse(turned, self.shapes, self.structure)
 
     def in_structure(self):
-        return self.structure
+        return self.structure.unflatten(self.shapes)
+
+
+def _through(cycles: list[Multigrid | list[Multigrid]], field: Array) -> Array:
+    for cycle in cycles:
+        if isinstance(cycle, list):
+            columns = [one(v) for one, v in zip(cycle, field.T)]
+            field = jnp.stack(columns, axis=1)
+        else:
+            field = cycle(field) if field.ndim == 1 else jax.vmap(cycle, 1, 1)(field)
+    return field
 
 
 def step_preconditioner(
-    problem: AbstractEvolution, u0: Float[Array, "n *c"], *, renewable: bool = False
+    problem: AbstractEvolution, u0: PyTree[Array], *, renewable: bool = False
 ) -> StepPreconditioner:
     r"""Multigrid for `IMEX(preconditioner=...)`, for steps of any length.
 
@@ -97,9 +115,10 @@ def step_preconditioner(
     linear part is factored: $1 + g\,\kappa\,\Delta^2 \approx (1 - \sqrt{g \kappa}\,\Delta)^2$.
 
     Args:
-        problem: `AdvectionDiffusionReaction`, `BiharmonicDiffusion` or `CahnHilliard`, with
-            concrete arrays. A diffusivity in space counts with its mean, one in time as at t = 0.
-        u0: a state, for its shape.
+        problem: `AdvectionDiffusionReaction`, `BiharmonicDiffusion`, `CahnHilliard` or one of
+            your own with a `laplacian` and `factors`, with concrete arrays. A diffusivity in
+            space counts with its mean, one in time as at t = 0.
+        u0: a state: its shape, and the geometry where that is part of it.
         renewable: keep what `renewed(problem)`, a method of the result, needs to serve other
             operators in compiled code.
 
@@ -119,60 +138,29 @@ def step_preconditioner(
         >>> bool(jnp.abs(u - jnp.exp(-0.4) * u0).max() < 0.01)
         True
     """
-    laplacian, shifts = _factors(problem, getattr(u0, "shape", ()))
-    if not hasattr(u0, "shape") or u0.ndim not in (1, 2) or u0.shape[0] != laplacian.n:
-        shape = u0.shape if hasattr(u0, "shape") else type(u0).__name__
-        raise ValueError(f"u0 is {shape}, expected an array ({laplacian.n},) or ({laplacian.n}, c)")
-    hierarchy = shifted_multigrid(laplacian, conditions=problem.conditions, renewable=renewable)
-    return StepPreconditioner(hierarchy, shifts, jnp.shape(u0))
+    now, u0, factors = _factored(problem, u0)
+    hierarchy = shifted_multigrid(now.laplacian, conditions=now.conditions, renewable=renewable)
+    leaves, structure = jax.tree.flatten(u0)
+    shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves)
+    return StepPreconditioner(hierarchy, factors, shapes, structure)
 
 
-def _factors(problem, shape: tuple[int, ...]) -> tuple[AbstractOperator, Partial]:
-    """The Laplacian of a problem, and the function of g to the shifts."""
+def _factored(problem, u0) -> tuple[Any, PyTree[Array], Callable]:
+    """A problem frozen at a state, the state, and the function of g to the factors."""
     hint = "like AdvectionDiffusionReaction(laplacian)"
     instance(problem, AbstractEvolution, "problem", hint)
-    laplacian = getattr(problem, "laplacian", None)
-    if isinstance(problem, AdvectionDiffusionReaction) and laplacian is not None:
-        d = problem.diffusivity
-        d = d(0.0) if callable(d) else d
-        shifts = Partial(_diffusive, _mean(d, shape[1:], problem.active))
-    elif isinstance(problem, BiharmonicDiffusion):
-        shifts = Partial(_biharmonic, jnp.asarray(problem.stiffness))
-    elif isinstance(problem, CahnHilliard):
-        numbers = (problem.mobility, problem.splitting, problem.width)
-        shifts = Partial(_cahn_hilliard, *map(jnp.asarray, numbers))
-    else:
-        kind = type(problem).__name__
+    n = problem.n
+    if n is not None and not hasattr(u0, "shape"):
+        raise ValueError(f"u0 is {type(u0).__name__}, expected an array ({n},) or ({n}, c)")
+    for leaf in jax.tree.leaves(u0):
+        if jnp.ndim(leaf) not in (1, 2) or n not in (None, jnp.shape(leaf)[0]):
+            raise ValueError(f"u0 is {jnp.shape(leaf)}, expected an array ({n},) or ({n}, c)")
+    u0 = jax.tree.map(lambda x: as_float(x, "u0"), u0)
+    t = jnp.zeros((), dtype_of(u0))
+    now = problem.at(t, u0)
+    if getattr(now, "laplacian", None) is None or now.factors(t, u0) is None:
         raise ValueError(
-            f"there is no preconditioner for problem = {kind}: it has no diffusion, or none known"
+            f"there is no preconditioner for problem = {type(problem).__name__}: it has no "
+            "diffusion, or none known (no `laplacian` or no `factors`)"
         )
-    assert laplacian is not None
-    return laplacian, shifts
-
-
-def _mean(diffusivity, species: tuple[int, ...], on) -> Array:
-    """Over the points that are on: a number, or one for every species."""
-    d = jnp.asarray(diffusivity)
-    per_species = bool(species) and d.shape[-1:] == species
-    d = d.reshape(-1, *species) if per_species else d
-    counted = None
-    if on is not None and d.shape[:1] == on.shape:
-        counted = on.reshape(-1, *[1] * (d.ndim - 1))
-    return jnp.mean(d, axis=0 if per_species else None, where=counted)
-
-
-def _diffusive(diffusivity, g):
-    return (g * diffusivity)[None]
-
-
-def _biharmonic(stiffness, g):
-    return jnp.full(2, jnp.sqrt(g * stiffness))
-
-
-def _cahn_hilliard(mobility, splitting, width, g):
-    r"""$1 - s\,\Delta + q\,\Delta^2$ with $s = g M s_0$, $q = g M \epsilon^2$."""
-    total, product = g * mobility * splitting, g * mobility * width**2
-    # Complex factors have the modulus √q.
-    half = jnp.sqrt(jnp.maximum((total / 2) ** 2 - product, 0))
-    large = jnp.maximum(total / 2 + half, jnp.sqrt(product))
-    return jnp.stack([large, product / jnp.where(large > 0, large, 1)])
+    return now, u0, canonical(lambda g: now.factors(g, u0), t)

@@ -20,14 +20,8 @@ from .asked import check_coefficients, check_saves, checked_rate, checked_state,
 from .chebyshev import Loop
 from .explicit import RKC2
 from .guard import Guard, guarded
-from .implicit import IMEX
-from .pde import (
-    AbstractEvolution,
-    AdvectionDiffusionReaction,
-    BiharmonicDiffusion,
-    CahnHilliard,
-    WaveEquation,
-)
+from .phases import Linear, Rest
+from .problem import AbstractEvolution
 from .stability import Tableau, Verdict, check_steps, tableau_of
 from .states import Norm, root_mean_square
 
@@ -44,7 +38,7 @@ _GROWN = 100.0
 
 
 def choose_solver(problem: AbstractEvolution) -> tuple[dfx.AbstractSolver, str]:
-    """A solver that suits the kind of problem, and why.
+    """A solver that suits the kind of problem, and why: its `suggested_solver()`.
 
     Only the kind counts, not the values, so that the choice is the same under `jit` and
     `grad`. Reactions faster than diffusion on the smallest scale call for `SDIRK`, which is
@@ -64,31 +58,7 @@ def choose_solver(problem: AbstractEvolution) -> tuple[dfx.AbstractSolver, str]:
         'Tsit5: waves are not stiff'
     """
     _problem(problem)
-    if isinstance(problem, WaveEquation):
-        return dfx.Tsit5(), "Tsit5: waves are not stiff"
-    if isinstance(problem, BiharmonicDiffusion | CahnHilliard):
-        return IMEX(order=3), "IMEX(order=3): fourth order in space is too stiff for explicit steps"
-    if isinstance(problem, AdvectionDiffusionReaction):
-        if problem.laplacian is None:
-            note = f"; {UNDAMPED}" if undamped(problem) else ""
-            return dfx.Tsit5(), f"Tsit5: advection is not stiff{note}"
-        if problem.moving:
-            return IMEX(order=3), "IMEX(order=3): advection explicit, diffusion implicit"
-        return RKC2(), "RKC2: diffusion, by explicit steps with many stages"
-    return IMEX(order=3), "IMEX(order=3): a linear part of unknown stiffness"
-
-
-UNDAMPED = (
-    "without diffusion or damping short waves may grow on scattered points: see "
-    "`stabilization=`, `hyperviscosity` and `upwinding`"
-)
-
-
-def undamped(problem: AbstractEvolution) -> bool:
-    """True for advection with nothing that damps short waves."""
-    if not isinstance(problem, AdvectionDiffusionReaction):
-        return False
-    return problem.laplacian is None and problem.stabilization is None
+    return problem.suggested_solver()
 
 
 class Run(eqx.Module):
@@ -235,8 +205,31 @@ def _terms(problem: AbstractEvolution, solver: dfx.AbstractSolver, now):
     """The right-hand side, in two parts for solvers that treat them differently."""
     if not _takes_two(solver):
         return dfx.ODETerm(canonical(checked_rate(problem.rate), *now))
-    parts = (problem.explicit_rate, lambda t, u, args: problem.implicit_rate(t, u, args))
-    return dfx.MultiTerm(*(dfx.ODETerm(canonical(checked_rate(part), *now)) for part in parts))
+    if type(problem).at is AbstractEvolution.at:
+        parts = (problem.explicit_rate, problem.implicit_rate)
+        return dfx.MultiTerm(*(dfx.ODETerm(canonical(checked_rate(part), *now)) for part in parts))
+    linear = _linear_part(problem, now)
+    whole = canonical(checked_rate(problem.rate), *now)
+    return dfx.MultiTerm(dfx.ODETerm(Rest(whole, linear)), dfx.ODETerm(linear))
+
+
+def _linear_part(problem: AbstractEvolution, now) -> Linear:
+    """In two phases, each a program."""
+    t, u, _ = now
+    fixed = []
+
+    def freeze(t, u):
+        arrays, rest = eqx.partition(problem.at(t, problem.closed(t, u)), eqx.is_array)
+        fixed.append(rest)
+        return arrays
+
+    def apply(t, u, arrays):
+        return eqx.combine(arrays, fixed[0]).implicit_rate(t, u, None)
+
+    first = canonical(freeze, t, u)
+    shapes = jax.eval_shape(first, t, u)
+    arrays = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    return Linear(first, canonical(checked_rate(apply), t, u, arrays))
 
 
 def _takes_two(solver: dfx.AbstractSolver) -> bool:

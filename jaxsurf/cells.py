@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .arguments import as_float, finite, instance, is_concrete, mask, real, whole
+from .arguments import as_float, finite, instance, mask, real, whole
+from .failures import is_concrete
 from .neighbors import Neighbors
 from .sheets import cosine_slack
 

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from ..arguments import as_float, is_concrete, raise_at, real
+from ..arguments import as_float, real
 from ..boundary import check_border
+from ..failures import is_concrete, raise_at
 from ..stencils.algebra import AbstractOperator
 from .higher import WaveEquation
 from .problem import AbstractEvolution

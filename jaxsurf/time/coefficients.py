@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..arguments import as_float, finite, instance, is_concrete, raise_at, real, switched_off
+from ..arguments import as_float, finite, instance, real, switched_off
 from ..boundary import Closure
+from ..failures import is_concrete, raise_at
 from ..functions import numbers_as_arrays
 from ..stencils.algebra import AbstractOperator
 

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from ..arguments import instance, raise_at, real
+from ..arguments import instance, real
+from ..failures import raise_at
 from ..functions import numbers_as_arrays
 from .asked import bad_rows
 from .checkpoint import Checkpoint, integrate_in_parts

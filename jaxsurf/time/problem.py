@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from ..arguments import as_float, is_concrete
+from ..arguments import as_float
 from ..boundary import Closure
+from ..failures import is_concrete
 from ..stencils.algebra import AbstractOperator
 from .coefficients import InTime, user
 from .implicit import IMEX

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, PyTree
 
-from ..arguments import instance, is_concrete, real, whole
+from ..arguments import instance, real, whole
+from ..failures import is_concrete
 from ..functions import canonical, numbers_as_arrays
 from .asked import check_coefficients, check_saves, checked_rate, checked_state, checked_times
 from .chebyshev import Loop
@@ -184,7 +185,7 @@ def planned(
     saveat = _saving(saveat, arrays, now)
     limit = _GROWN * root_mean_square(u0) if problem.contractive else jnp.asarray(jnp.inf, t0.dtype)
     parts = (terms, solver, t0, t1, dt0, u0, args, controller, limit, saveat, event, adjoint)
-    concrete = is_concrete(*jax.tree.leaves(parts), jnp.zeros(()) + 0)  # also not inside a `jit`
+    concrete = is_concrete(parts, jnp.zeros(()) + 0)  # also not inside a `jit`
     _log.info("%s over [%s, %s] by %s", type(problem).__name__, t0, t1, why)
     run = Run(*parts, allowed, bool(progress), bool(throw) and not concrete)
     return Plan(run, name, f"{name}: given" if why == "given" else why, concrete)

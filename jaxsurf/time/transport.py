@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..arguments import as_float, finite, instance, is_concrete, switched_off
+from ..arguments import as_float, finite, instance, switched_off
 from ..boundary import Closure
+from ..failures import is_concrete
 from ..operators import divergence_of
 from ..stencils.algebra import AbstractOperator
 from ..stencils.gathers import take

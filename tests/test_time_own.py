@@ -75,6 +75,16 @@ def test_heat_on_a_growing_sphere(solver):
     assert abs(factor / exact(-2) - 1) < 1e-2
 
 
+def test_derivatives_through_the_geometry():
+    """In the rate of growth: through points, stencils and linear solves (to 4e-10)."""
+    weights = jnp.exp(CLOUD.points[:, 0])
+    f = lambda a: jnp.vdot(weights, Z * end(a, js.IMEX(order=2), steps=2)[1])
+    h = 1e-3
+    difference = (f(GROWTH + h) - f(GROWTH - h)) / (2 * h)
+    third = abs(float(f(GROWTH))) * END**3  # of the size of the third derivative
+    assert abs(float(jax.grad(f)(GROWTH) - difference)) < 5e-6 * abs(difference) + h**2 * third
+
+
 @pytest.mark.core
 def test_a_problem_of_ones_own_is_preconditioned():
     """The cycles invert 1 - g L at the geometry of the state, and leave the points alone."""

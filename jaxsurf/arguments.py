@@ -314,6 +314,8 @@ def _short(value: Any) -> str:
     """A value as it is told in a message."""
     if hasattr(value, "shape") and hasattr(value, "dtype") and np.ndim(value) > 0:
         return _described(value, value)
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
     text = repr(value)
     kind = type(value).__name__
     return f"{text} ({kind})" if len(text) <= 40 else f"a {kind}"

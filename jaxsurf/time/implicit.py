@@ -104,7 +104,7 @@ class IMEX(dfx.AbstractAdaptiveSolver):
         order: 2 (three stages; Giraldo, Kelly and Constantinescu 2013), 3 or 4 (four and six
             stages; Kennedy and Carpenter 2003), each with an embedded method one order lower.
             All are L-stable in the implicit part.
-        solver: of the linear systems; by default BiCGStab (GMRES in single precision).
+        solver: of the linear systems; by default `js.BiCGStab` with this tolerance.
         tolerance: largest residual of a linear system over its right-hand side; by default
             the 0.6th power of the rounding unit, 4e-10 in double precision.
         preconditioner: function of $\gamma\,\Delta t$ that returns an approximate inverse of

@@ -10,16 +10,17 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, PyTree
 
+from ..solve.krylov import BiCGStab
 from .states import dtype_of, root_mean_square
 
 
 class Relative(lx.AbstractLinearSolver):
     """A linear solver whose tolerance is relative to the norm of the right-hand side.
 
-    Krylov solvers of lineax weigh the residual point by point with the right-hand side, which
-    may vanish somewhere; here it is brought to norm one. The residual is then computed afresh,
-    because the recursions of BiCGStab may lose it. Systems that are not solved give NaN: nobody
-    looks at the result codes of those that derivatives solve.
+    That of `js.BiCGStab` is. Krylov solvers of lineax weigh the residual point by point with the
+    right-hand side, which may vanish somewhere; for them it is brought to norm one, and the
+    residual is then computed afresh, because the recursions of BiCGStab may lose it. Systems that
+    are not solved give NaN: nobody looks at the result codes of those that derivatives solve.
 
     Args:
         solver: does the work.
@@ -36,6 +37,20 @@ class Relative(lx.AbstractLinearSolver):
 
     def compute(self, state, vector, options):
         krylov, operator = state
+        if isinstance(self.solver, BiCGStab):
+            x, result, stats = self.solver.compute(krylov, vector, options)
+            good = result == lx.RESULTS.successful
+        else:
+            x, result, stats, good = self._at_norm_one(krylov, operator, vector, options)
+        # Too many steps of this solver are not to be mistaken for too many steps in time.
+        mild = (result == lx.RESULTS.successful) | (result == lx.RESULTS.max_steps_reached)
+        result = lx.RESULTS.where(
+            good, lx.RESULTS.successful, lx.RESULTS.where(mild, lx.RESULTS.stagnation, result)
+        )
+        x = jax.tree.map(lambda x: jnp.where(good | self.partial, x, jnp.nan), x)
+        return x, result, stats
+
+    def _at_norm_one(self, krylov, operator, vector, options):
         norm = root_mean_square(vector)
         scale = jnp.where(norm > 0, norm, 1)
         unit = jax.tree.map(lambda v: v / scale, vector)
@@ -50,13 +65,7 @@ class Relative(lx.AbstractLinearSolver):
         simple = missed(jax.tree.map(lambda a: factor * a, image)) <= self.tolerance
         x = jax.tree.map(lambda x, u: jnp.where(simple, factor * u, x), x, unit)
         good = missed(operator.mv(x)) <= 10 * self.tolerance
-        # Too many steps of this solver are not to be mistaken for too many steps in time.
-        mild = (result == lx.RESULTS.successful) | (result == lx.RESULTS.max_steps_reached)
-        result = lx.RESULTS.where(
-            good, lx.RESULTS.successful, lx.RESULTS.where(mild, lx.RESULTS.stagnation, result)
-        )
-        scale = jnp.where(good | self.partial, scale, jnp.nan)
-        return jax.tree.map(lambda x: scale * x, x), result, stats
+        return jax.tree.map(lambda x: scale * x, x), result, stats, good
 
     def transpose(self, state, options):
         inner, operator = state
@@ -77,8 +86,7 @@ def relative(
 ) -> Relative:
     tolerance = tolerance_of(tolerance, y)
     if solver is None:
-        kind = lx.BiCGStab if dtype_of(y) == jnp.float64 else lx.GMRES
-        solver = kind(rtol=0.0, atol=tolerance, norm=root_mean_square, max_steps=_KRYLOV_STEPS)
+        solver = BiCGStab(rtol=tolerance, max_steps=_KRYLOV_STEPS)
     return Relative(solver, tolerance, partial)
 
 

@@ -78,6 +78,7 @@ class Made:
     def __getattr__(self, name):
         value = {
             "neighbors": lambda: js.choose_neighbors(self.cloud),
+            "surface": lambda: js.discretize(self.cloud, self.neighbors, method=js.GFDM(degree=2)),
             "laplacian": lambda: js.laplace_beltrami(self.cloud),
             "gradient": lambda: js.surface_gradient(self.cloud),
             "conditions": lambda: js.dirichlet(self.cloud.boundary),
@@ -126,6 +127,23 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
     "diffusion": ("closed", "", lambda m: js.diffusion(m.cloud, 1 + m.u**2).weights),
     "mean_curvature": ("closed", "", lambda m: js.mean_curvature(m.cloud)),
     "principal_curvatures": ("closed", "", lambda m: js.principal_curvatures(m.cloud)),
+    "refit_normals": (
+        "closed",
+        "neighbors",
+        lambda m: js.refit_normals(m.cloud.points, m.cloud.normals, m.neighbors, degree=2),
+    ),
+    "areas": ("closed", "surface", lambda m: m.surface.areas),
+    "interpolate": (
+        "closed",
+        "surface",
+        lambda m: m.surface.interpolate(m.u, m.cloud.points[::2]),
+    ),
+    "moved": ("closed", "surface", lambda m: m.surface.moved(1.1 * m.cloud.points).laplacian),
+    "conservative_weights": (
+        "closed",
+        "laplacian",
+        lambda m: js.conservative_weights(m.laplacian, m.number),
+    ),
     "L(u)": ("closed", "laplacian", lambda m: m.laplacian(m.u)),
     "G(u)": ("closed", "gradient", lambda m: m.gradient(m.u)),
     "spectral_estimate": (

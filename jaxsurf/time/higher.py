@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -24,10 +25,25 @@ from .coefficients import (
 from .implicit import IMEX
 from .problem import AbstractEvolution, at_time, balanced, homogeneous, per_point, same_shape
 
-_FOURTH = "IMEX(order=3): fourth order in space is too stiff for explicit steps"
+
+class _FourthOrder(AbstractEvolution):
+    """What equations with the Laplacian applied twice have in common."""
+
+    laplacian: eqx.AbstractVar[AbstractOperator]
+
+    @property
+    def diffusive(self):
+        return True
+
+    @property
+    def n(self):
+        return self.laplacian.n
+
+    def suggested_solver(self):
+        return IMEX(order=3), "IMEX(order=3): fourth order in space is too stiff for explicit steps"
 
 
-class BiharmonicDiffusion(AbstractEvolution):
+class BiharmonicDiffusion(_FourthOrder):
     r"""Diffusion of fourth order, $\partial_t u = -\kappa\,\Delta_S^2 u + f(t, u)$.
 
     Args:
@@ -75,19 +91,8 @@ class BiharmonicDiffusion(AbstractEvolution):
         self.mass = check_mass(mass, conditions, n, laplacian.active)
 
     @property
-    def diffusive(self):
-        return True
-
-    @property
     def contractive(self):
         return self.reaction is None and self.conditions is None
-
-    @property
-    def n(self):
-        return self.laplacian.n
-
-    def suggested_solver(self):
-        return IMEX(order=3), _FOURTH
 
     def factors(self, g, u0):
         return jnp.full(2, jnp.sqrt(g * self.stiffness))
@@ -102,7 +107,7 @@ class BiharmonicDiffusion(AbstractEvolution):
         return same_shape(user(self.reaction, "reaction", t, u, args), u, "reaction")
 
 
-class CahnHilliard(AbstractEvolution):
+class CahnHilliard(_FourthOrder):
     r"""Separation of two phases, $\partial_t u = M\,\Delta_S(W'(u) - \epsilon^2\,\Delta_S u)$.
 
     $W = (u^2 - 1)^2 / 4$ by default: the phases are u = ±1, the interface is some $4\epsilon$
@@ -158,17 +163,6 @@ class CahnHilliard(AbstractEvolution):
         self.mobility = number(mobility, "mobility", 0)
         self.splitting = number(splitting, "splitting", 0)
         self.mass = check_mass(mass, conditions, n, laplacian.active)
-
-    @property
-    def diffusive(self):
-        return True
-
-    @property
-    def n(self):
-        return self.laplacian.n
-
-    def suggested_solver(self):
-        return IMEX(order=3), _FOURTH
 
     def factors(self, g, u0):
         r"""$1 - s\,\Delta + q\,\Delta^2$ with $s = g M s_0$, $q = g M \epsilon^2$."""

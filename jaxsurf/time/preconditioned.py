@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ..arguments import as_float, instance
+from ..arguments import as_float
 from ..functions import canonical
 from ..solve.precondition import Multigrid
 from ..solve.shifted import ShiftedMultigrid, shifted_multigrid
 from ..stencils.lineax import Square, matrix_free
-from .problem import AbstractEvolution
+from .problem import AbstractEvolution, checked_problem
 from .states import dtype_of
 
 
@@ -147,9 +147,7 @@ def step_preconditioner(
 
 def _factored(problem, u0) -> tuple[Any, PyTree[Array], Callable]:
     """A problem frozen at a state, the state, and the function of g to the factors."""
-    hint = "like AdvectionDiffusionReaction(laplacian)"
-    instance(problem, AbstractEvolution, "problem", hint)
-    n = problem.n
+    n = checked_problem(problem).n
     if n is not None and not hasattr(u0, "shape"):
         raise ValueError(f"u0 is {type(u0).__name__}, expected an array ({n},) or ({n}, c)")
     for leaf in jax.tree.leaves(u0):
@@ -158,9 +156,10 @@ def _factored(problem, u0) -> tuple[Any, PyTree[Array], Callable]:
     u0 = jax.tree.map(lambda x: as_float(x, "u0"), u0)
     t = jnp.zeros((), dtype_of(u0))
     now = problem.at(t, u0)
-    if getattr(now, "laplacian", None) is None or now.factors(t, u0) is None:
+    factors = lambda g: now.factors(g, u0)
+    if getattr(now, "laplacian", None) is None or jax.eval_shape(factors, t) is None:
         raise ValueError(
             f"there is no preconditioner for problem = {type(problem).__name__}: it has no "
             "diffusion, or none known (no `laplacian` or no `factors`)"
         )
-    return now, u0, canonical(lambda g: now.factors(g, u0), t)
+    return now, u0, canonical(factors, t)

@@ -3,6 +3,7 @@ r"""Evolution equations by the method of lines: what changes a field, split by h
 from __future__ import annotations
 
 import abc
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from ..arguments import as_float
+from ..arguments import as_float, instance
 from ..boundary import Closure
 from ..failures import is_concrete
 from ..stencils.algebra import AbstractOperator
@@ -163,6 +164,11 @@ class AbstractEvolution(eqx.Module):
 
 
 # --- pieces --------------------------------------------------------------------------------
+
+
+def checked_problem(problem: Any) -> AbstractEvolution:
+    hint = "like AdvectionDiffusionReaction(laplacian)"
+    return instance(problem, AbstractEvolution, "problem", hint)
 
 
 def known_active(*parts) -> Bool[Array | np.ndarray, " n"] | None:

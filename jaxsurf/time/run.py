@@ -22,7 +22,7 @@ from .chebyshev import Loop
 from .explicit import RKC2
 from .guard import Guard, guarded
 from .phases import Linear, Rest
-from .problem import AbstractEvolution
+from .problem import AbstractEvolution, checked_problem
 from .stability import Tableau, Verdict, check_steps, tableau_of
 from .states import Norm, root_mean_square
 
@@ -58,8 +58,7 @@ def choose_solver(problem: AbstractEvolution) -> tuple[dfx.AbstractSolver, str]:
         >>> js.choose_solver(js.WaveEquation(js.laplace_beltrami(js.sphere(500))))[1]
         'Tsit5: waves are not stiff'
     """
-    _problem(problem)
-    return problem.suggested_solver()
+    return checked_problem(problem).suggested_solver()
 
 
 class Run(eqx.Module):
@@ -143,7 +142,7 @@ def planned(
     max_steps, progress, throw,
 ) -> Plan:  # fmt: skip
     """Check all that `integrate` is given, and bring it into the form that is compiled."""
-    _problem(problem)
+    checked_problem(problem)
     u0 = checked_state(problem, u0)
     t0, t1, dt0 = checked_times(problem, u0, t0, t1, dt0)
     args = numbers_as_arrays(args)
@@ -195,11 +194,6 @@ _LIKE = dict(
     solver="js.RKC2()", event="js.steady_state()", controller="dfx.PIDController(...)",
     adjoint="dfx.ForwardMode()", saveat="dfx.SaveAt(ts=...)",
 )  # fmt: skip
-
-
-def _problem(problem: Any) -> None:
-    hint = "like AdvectionDiffusionReaction(laplacian)"
-    instance(problem, AbstractEvolution, "problem", hint)
 
 
 def _terms(problem: AbstractEvolution, solver: dfx.AbstractSolver, now):

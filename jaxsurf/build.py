@@ -3,6 +3,7 @@ r"""From a cloud to stencils: neighbourhoods chosen, weights in blocks, what is 
 from __future__ import annotations
 
 import warnings
+from contextlib import nullcontext
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from .adapt import residual_tolerance as residual_tolerance
 from .arguments import as_many, instance
 from .arguments import mask as checked_mask
 from .cloud import PointCloud
-from .compiling import copying_jit, namespace, sized_jit
+from .compiling import at_once, copying_jit, namespace, sized_jit
 from .failures import is_concrete, needs_values, raise_at, refuse, without_derivatives
 from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .neighbors import Neighbors, Rows, find_neighbors, nearest_of, switched_on
@@ -103,7 +104,10 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     if border is not None and cloud.active is not None:
         border = border & cloud.active
     known = (diagnostics, border, cloud.active)
-    stencil = Stencil(_turned(neighbors.indices), values, components, (), *known)
+    # Lists that are known stay known in compiled code: transposes can gather there.
+    with at_once() if is_concrete(neighbors.indices) else nullcontext():
+        slots = _turned(neighbors.indices)
+    stencil = Stencil(slots, values, components, (), *known)
     if throw and is_concrete(values):
         _check(stencil, neighbors, method, target, cloud.dim)
     return stencil

@@ -157,6 +157,8 @@ def test_bad_operators_are_refused():
     with pytest.raises(ValueError, match="row 5 of the operator is zero"):
         js.multigrid(empty)
     with pytest.raises(ValueError, match="outside jit"):
+        jax.jit(lambda operator: js.multigrid(operator).coarsest)(laplacian)
+    with pytest.raises(ValueError, match="pass mean_zero=True or False"):
         jax.jit(lambda w: js.multigrid(js.Stencil(laplacian.indices, w)).coarsest)(
             laplacian.weights
         )

@@ -108,19 +108,52 @@ def test_steps_are_those_of_a_hierarchy_made_anew(method, closed):
         assert count <= 1.3 * int(steps(anew, operator))
 
 
-def test_derivatives_in_points_through_compiled_solves():
+@pytest.mark.parametrize("given", [True, False])
+def test_derivatives_in_points_through_compiled_solves(given):
+    """With aggregates found outside by weights, or, by neighbours alone, while it is compiled."""
     cycle = js.multigrid(SURFACE.laplacian, renewable=True)
     weights = 1 + X
 
+    def solution(t):
+        laplacian = SURFACE.moved(twisted(t)).laplacian
+        options = {"project": True, "rtol": 1e-12, "mean_zero": True}
+        if given:
+            options["preconditioner"] = cycle.renewed(laplacian)
+        return js.solve(laplacian, F, **options)
+
     @jax.jit
     def scalar(t):
-        laplacian = SURFACE.moved(twisted(t)).laplacian
-        options = {"project": True, "rtol": 1e-12, "preconditioner": cycle.renewed(laplacian)}
-        return jnp.sum(weights * js.solve(laplacian, F, **options).value ** 2)
+        return jnp.sum(weights * solution(t).value ** 2)
 
     step = 1e-4
     difference = (scalar(0.5 + step) - scalar(0.5 - step)) / (2 * step)
     np.testing.assert_allclose(jax.jit(jax.grad(scalar))(0.5), difference, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["closed", "dirichlet", "screened"])
+def test_aggregates_found_by_neighbours_serve_as_well(kind):
+    surface = js.discretize(CLOUD, method=js.GFDM(degree=4))
+    conditions = js.close(CLOUD, BAND) if kind == "dirichlet" else None
+    options = {"project": True, "conditions": conditions, "mean_zero": kind == "closed"}
+
+    def solution(t):
+        laplacian = surface.moved(twisted(t)).laplacian
+        return js.solve(1 - laplacian if kind == "screened" else laplacian, F, **options)
+
+    compiled, host = jax.jit(solution)(0.5), solution(0.5)
+    assert compiled.stats["num_steps"] <= 1.3 * host.stats["num_steps"]
+    assert_same(host.value, compiled.value, 1e-6)
+
+
+@pytest.mark.core
+def test_weights_and_newton_in_compiled_code():
+    laplacian, total = SURFACE.laplacian, SURFACE.areas.sum()
+    moved = lambda t: js.Stencil(laplacian.indices, t * laplacian.weights)
+    weights = jax.jit(lambda t: js.conservative_weights(moved(t), total))(2.0)
+    np.testing.assert_allclose(weights, js.conservative_weights(laplacian, total), rtol=1e-8)
+    reaction = lambda u, args: -u - u**3
+    newton = lambda t: js.solve_nonlinear(moved(t), reaction, F, rhs=-F).value
+    np.testing.assert_allclose(jax.jit(newton)(2.0), newton(2.0), rtol=1e-6)
 
 
 def test_vmap_over_weights():

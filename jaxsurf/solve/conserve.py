@@ -39,8 +39,8 @@ def conservative_weights(
     Args:
         operator: L, scalar, of a connected closed surface: it annihilates the constants.
         total: what the weights add up to: the area of the surface, `surface.areas.sum()`.
-        preconditioner: from `multigrid(operator)`; made here if None, also under `grad`; not
-            under `jit` and `vmap`.
+        preconditioner: from `multigrid(operator)`; made here if None, under `jit` and `vmap` where
+            the neighbours are concrete.
 
     Returns:
         Weights `(n,)`, in the units of `total`; as `mass=` of a problem in time they make its
@@ -51,8 +51,8 @@ def conservative_weights(
     Differentiable: forward and reverse, in the weights of the operator and in `total`.
     Raises:
         TypeError: no operator or preconditioner.
-        ValueError: an operator with components, one that does not annihilate the constants; under
-            `jit` and `vmap`, no preconditioner.
+        ValueError: an operator with components, one that does not annihilate the constants; no
+            preconditioner for traced neighbours.
         RuntimeError: no such weights have been found.
 
     Example:
@@ -67,7 +67,7 @@ def conservative_weights(
     check_system(operator, None, preconditioner, None, 0.0)
     real(total, "total", above=0)
     if preconditioner is None:
-        preconditioner = multigrid(operator)
+        preconditioner = multigrid(operator, mean_zero=True)
     if preconditioner.mean_zero is False:
         raise ValueError(
             "operator does not annihilate the constants: no weights are conserved, as where heat "

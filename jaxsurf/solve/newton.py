@@ -63,8 +63,8 @@ def solve_nonlinear(
         args: parameters of the reaction, any pytree; derivatives in them need them here.
         rhs: f, `(n,)` or a number.
         conditions: from `js.close` or `js.with_ghosts`.
-        preconditioner: for $L + r'$; `js.multigrid` of it at u0 if None, also under
-            `grad`; not under `jit` and `vmap`. One serves all steps.
+        preconditioner: for $L + r'$; `js.multigrid` of it at u0 if None, under
+            `jit` and `vmap` where the neighbours are concrete. One serves all steps.
         solver: of the linear systems; `js.BiCGStab` if None, loosely but for derivatives.
         rtol: the residual may be this share of its size at u0 (or of f, if that is larger);
             1e-8 in double and 1e-4 in single precision if None.
@@ -116,7 +116,8 @@ def solve_nonlinear(
     reaction = canonical(reaction, u0, args)
     problem = _Problem(operator, conditions, reaction, args, rhs)
     if preconditioner is None:
-        preconditioner = multigrid(operator + problem.slope(u0), conditions=conditions)
+        linearized = operator + problem.slope(u0)
+        preconditioner = multigrid(linearized, conditions=conditions, mean_zero=False)
     if preconditioner.mean_zero:
         raise ValueError(
             "singular at u0: the operator annihilates the constants and the reaction has slope "

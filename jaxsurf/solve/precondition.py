@@ -13,12 +13,20 @@ from jaxtyping import Array, Float
 
 from ..arguments import instance, switched_off
 from ..boundary import Closure
-from ..compiling import sized_jit
+from ..compiling import at_once, sized_jit
+from ..failures import is_concrete, needs_values, without_derivatives
 from ..stencils.algebra import AbstractOperator, Composition
 from ..stencils.padded import PaddedMatrix
 from ..stencils.stencil import Stencil
 from . import aggregation, renewal
-from .reduced import annihilates_constants, check_kinds, free_operator, free_points, reduced_matrix
+from .reduced import (
+    annihilates_constants,
+    check_kinds,
+    free_operator,
+    free_points,
+    reduced_matrix,
+    stand_in,
+)
 
 # The coarsest system has at most this many unknowns and is solved by a dense inverse.
 _COARSEST = 400
@@ -266,6 +274,7 @@ def multigrid(
     conditions: Closure | None = None,
     single: bool = True,
     renewable: bool = False,
+    mean_zero: bool | None = None,
 ) -> AbstractPreconditioner:
     r"""Smoothed-aggregation multigrid (Vaněk, Mandel and Brezina 1996) as a preconditioner.
 
@@ -273,24 +282,28 @@ def multigrid(
     dense coarsest solve, is plain JAX on padded arrays: it runs under `jit` and `vmap`, and its
     exact transpose serves adjoint solves. It is a constant for derivatives; a hierarchy made
     for one operator serves nearby ones too (other weights on the same neighbours), at the
-    price of more steps, or is renewed.
+    price of more steps, or is renewed. Under `jit` and `vmap`, where the neighbours are known and
+    the weights are not, as on `surface.moved(points)`, aggregates are found by the neighbours and
+    the numbers computed in compiled code.
 
     Args:
-        operator: scalar, with concrete arrays. For an indefinite Helmholtz operator
+        operator: scalar, with concrete neighbours. For an indefinite Helmholtz operator
             $\Delta + \kappa^2$ pass $\Delta - \kappa^2$ here.
         conditions: from `js.close` or `js.with_ghosts`; the same as for `js.solve`.
         single: hold and run the cycle in single precision, which halves its time. The solution
             is not affected: its residual is computed in the precision of the operator.
         renewable: keep what `Multigrid.renewed` needs to serve other weights in compiled code.
+        mean_zero: whether an operator of traced weights annihilates the constants; of concrete
+            ones it is seen.
 
     Returns:
         To be passed to `js.solve`. A composition gets one hierarchy for each factor.
 
     Raises:
         ImportError: pyamg is not installed (extra `multigrid`).
-        ValueError: an operator that is traced, not finite, or has components or zero rows; a
-            part of the points that nothing ties to the rest and on which constants are
-            undetermined.
+        ValueError: an operator whose neighbours are traced, that is not finite, or has components
+            or zero rows; traced weights without `mean_zero`; a part of the points that nothing
+            ties to the rest and on which constants are undetermined.
 
     Example:
         >>> laplacian = js.laplace_beltrami(js.sphere(2_000))
@@ -299,15 +312,23 @@ def multigrid(
     """
     check_kinds(operator, conditions)
     if isinstance(operator, Composition) and conditions is None:
-        both = operator.outer, operator.inner
-        return _Product.of(*(multigrid(o, single=single, renewable=renewable) for o in both))
-    return _hierarchy(operator, conditions, single, renewable)
+        of = lambda o: multigrid(o, single=single, renewable=renewable, mean_zero=mean_zero)
+        return _Product.of(of(operator.outer), of(operator.inner))
+    known = without_derivatives((operator, conditions))
+    if is_concrete(known):
+        return _hierarchy(operator, conditions, single, renewable)
+    with at_once():
+        alike = stand_in(*known)
+        if mean_zero is None:
+            needs_values("operator and conditions", known, instead="pass mean_zero=True or False")
+        made = _hierarchy(alike[0], alike[1], single, True, mean_zero)
+    return made.renewed(operator, conditions=conditions)
 
 
-def _hierarchy(operator, conditions, single: bool, renewable: bool) -> Multigrid:
+def _hierarchy(operator, conditions, single, renewable, mean_zero=None) -> Multigrid:
     fine = reduced_matrix(operator, conditions)
     free = free_points(operator, conditions)
-    mean_zero = annihilates_constants(fine, free)
+    mean_zero = annihilates_constants(fine, free) if mean_zero is None else mean_zero
     dtype = np.dtype(np.float32) if single else fine.dtype
     width = USED * operator.k if isinstance(operator, Stencil) else None
     levels, made = [], []

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
 from ..arguments import as_many, instance
 from ..boundary import Closure, Restriction
-from ..failures import is_concrete, without_derivatives
+from ..failures import is_concrete, needs_values, without_derivatives
 from ..stencils.algebra import AbstractOperator, check_scalar
+from ..stencils.stencil import Stencil
 
 # Row sums up to this many times round-off are those of an operator that annihilates constants.
 _ROUNDOFF = 32
+# So many of a point's neighbours are strongly connected to it, and others by this much of that.
+_NEAR, _FAR = 8, 1e-3
 
 
 def check_kinds(operator, conditions) -> None:
@@ -32,6 +37,46 @@ def free_operator(operator, conditions) -> tuple[AbstractOperator, Restriction]:
         operator = operator @ conditions.extension
     all_free = conditions is None and restriction.on is None
     return operator if all_free else restriction @ operator, restriction
+
+
+def stand_in(operator, conditions) -> tuple[AbstractOperator, Closure | None]:
+    """Concrete ones with the connections of a traced operator and conditions, for aggregates.
+
+    A point's nearest neighbours count alike, others hardly: of a Laplacian's weights that much is
+    known without their values.
+
+    Raises:
+        ValueError: the connections are traced too.
+    """
+    whole = lambda x: isinstance(x, Stencil | Closure)
+    return jax.tree.map(_stood_in, (operator, conditions), is_leaf=whole)
+
+
+def _stood_in(part):
+    if is_concrete(part):
+        return part
+    if isinstance(part, Stencil):
+        _known(part.indices, part.active)
+        check_scalar(part)
+        indices = np.asarray(part.indices)
+        used = indices != np.arange(part.n)  # padding refers to the point itself
+        weights = np.where(np.cumsum(used, axis=0) <= _NEAR, 1, _FAR) * used
+        weights[0] -= weights.sum(axis=0)
+        return Stencil(part.indices, jnp.asarray(weights), active=part.active)
+    if isinstance(part, Closure):
+        _known(part.rows, part.indices)
+        even = np.full(part.weights.shape, 1 / max(len(part.weights), 1))
+        return Closure(part.n, part.rows, part.indices, even)
+    return np.ones(part.shape, part.dtype)
+
+
+def _known(*connections) -> None:
+    needs_values(
+        "neighbours, mask and bound points",
+        connections,
+        instead="make the preconditioner outside jit and vmap, js.multigrid(..., renewable=True), "
+        "and pass preconditioner=that.renewed(operator)",
+    )
 
 
 def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:

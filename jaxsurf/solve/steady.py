@@ -62,8 +62,9 @@ def solve(
         rhs: f, `(n,)` or `(n, c)` for c problems at once; values at bound points do not count.
         conditions: from `js.close` or `js.with_ghosts`.
         preconditioner: `js.multigrid(operator, conditions=conditions)` if None, also under
-            `grad`; under `jit` and `vmap`, where values are not known, make it outside and pass
-            it, `renewed` inside where the operator is another. Or `js.jacobi(operator)`.
+            `grad`, and with `mean_zero` under `jit` and `vmap` where the neighbours are concrete.
+            Where these are traced, make it outside and pass it, `renewed` inside where the
+            operator is another. Or `js.jacobi(operator)`.
         solver: a solver of lineax; `js.BiCGStab(rtol, atol, max_steps)` if None.
         mean_zero: whether A annihilates the constants; seen from the preconditioner or a
             concrete operator if None.
@@ -112,7 +113,7 @@ def solve(
     whole(max_steps, "max_steps", least=1)
     concrete = is_concrete(operator, rhs, conditions, preconditioner)
     if preconditioner is None:
-        preconditioner = multigrid(operator, conditions=conditions)
+        preconditioner = multigrid(operator, conditions=conditions, mean_zero=mean_zero)
     if mean_zero is None:
         mean_zero = _is_mean_zero(operator, conditions, preconditioner)
     if solver is None:

@@ -137,8 +137,7 @@ def surface_divergence(
 
 def divergence_of(gradient: Stencil) -> Stencil:
     """The divergence, which has the weights of the gradient."""
-    known = (gradient.diagnostics, gradient.border, gradient.active)
-    return Stencil(gradient.indices, gradient.weights, (), gradient.out_shape, *known)
+    return gradient.of_weights(gradient.weights, in_shape=gradient.out_shape)
 
 
 def directional_derivative(
@@ -182,9 +181,7 @@ def along(gradient: Stencil, direction: Float[Array, "*n d"]) -> Stencil:
     """The derivative along a vector field, from the gradient."""
     direction = _field(direction, (gradient.n, *gradient.out_shape), "direction")
     direction = finite(direction, "direction", gradient.active).astype(gradient.weights.dtype)
-    weights = _along(switched_off(gradient.active, direction), gradient.weights)
-    known = (gradient.diagnostics, gradient.border, gradient.active)
-    return Stencil(gradient.indices, weights, (), (), *known)
+    return gradient.of_weights(_along(switched_off(gradient.active, direction), gradient.weights))
 
 
 def diffusion(
@@ -234,9 +231,7 @@ def diffusion(
     stencil = build(cloud, neighbors, method, Laplacian() if scalar else Hessian(), throw)
     weigh = _scalar_weights if scalar else _tensor_weights
     d = switched_off(cloud.active, d.astype(stencil.weights.dtype))
-    weights = weigh(d, cloud.seen.normals, stencil.indices, stencil.weights)
-    known = (stencil.diagnostics, stencil.border, stencil.active)
-    return Stencil(stencil.indices, weights, (), (), *known)
+    return stencil.of_weights(weigh(d, cloud.seen.normals, stencil.indices, stencil.weights))
 
 
 def _checked_diffusivity(diffusivity, cloud) -> Float[Array, "*n"]:

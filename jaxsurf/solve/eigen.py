@@ -263,7 +263,8 @@ def _sylvester(system: _System, space: Subspace, rhs: Float[Array, "n K"]) -> Fl
         def compute(system, space, b):
             matrix, free = system.to_scipy()
             matrix = matrix.T.tocsr() if transposed else matrix
-            return _spread(invariant.sylvester(matrix, _at(space, free), b[free]), free, *like)
+            space = space._replace(right=space.right[free], left=space.left[free])
+            return _spread(invariant.sylvester(matrix, space, b[free]), free, *like)
 
         like = b.shape[0], b.dtype
         return _on_host(compute, jax.ShapeDtypeStruct(b.shape, b.dtype), system, space, b)
@@ -317,7 +318,3 @@ def _spread(tree, free, n: int, dtype):
         tree = tree._replace(right=place(tree.right), left=place(tree.left))
         return jax.tree.map(one, tree)
     return one(place(tree))
-
-
-def _at(space: Subspace, free) -> Subspace:
-    return space._replace(right=space.right[free], left=space.left[free])

@@ -21,10 +21,9 @@ from ..discretization import Discretization
 from ..failures import is_concrete, needs_values, refuse
 from ..neighbors import Neighbors, find_neighbors, switched_on
 from ..stencils.gfdm import GFDM
-from ..stencils.lineax import Action
 from ..stencils.method import AbstractMethod
 from ..stencils.stencil import Stencil
-from .krylov import BiCGStab
+from .krylov import BiCGStab, solve_system
 from .paths import around, path_lengths, source_indices
 from .precondition import multigrid
 
@@ -264,10 +263,7 @@ def _integrate(x, normals, indices, share, direction, fixed, value, inverse, rto
     operator = eqx.tree_at(
         lambda s: s.table, _differences(indices, share, fixed), table, is_leaf=lambda x: x is None
     )
-    options = {"preconditioner": Action(preconditioner, rhs.dtype)}
-    matrix = Action(operator, rhs.dtype)
-    rhs = jnp.where(fixed, 0, rhs)
-    found = lx.linear_solve(matrix, rhs, BiCGStab(rtol), options=options, throw=False)
+    found = solve_system(operator, jnp.where(fixed, 0, rhs), BiCGStab(rtol), preconditioner)
     free = refuse(
         found.value,
         found.result != lx.RESULTS.successful,

@@ -14,6 +14,8 @@ from jaxtyping import Array, Float
 
 from ..arguments import real, whole
 from ..failures import is_concrete
+from ..stencils.algebra import AbstractOperator
+from ..stencils.lineax import Action
 
 _Results = lx.RESULTS
 
@@ -114,6 +116,14 @@ class BiCGStab(lx.AbstractLinearSolver):
 
     def assume_full_rank(self):
         return True
+
+
+def solve_system(
+    matrix: AbstractOperator, b: Float[Array, " n"], solver, inverse: AbstractOperator
+) -> lx.Solution:
+    """Solve by a solver of lineax, with an approximate inverse; does not raise."""
+    options = {"preconditioner": Action(inverse, b.dtype)}
+    return lx.linear_solve(Action(matrix, b.dtype), b, solver, options=options, throw=False)
 
 
 def scale_of(x: Float[Array, " n"]) -> Float[Array, ""]:

@@ -19,9 +19,8 @@ from ..compiling import sized_jit
 from ..failures import is_concrete, refuse
 from ..functions import canonical, numbers_as_arrays
 from ..stencils.algebra import AbstractOperator, Map
-from ..stencils.lineax import Action
 from ..stencils.stencil import prepared
-from .krylov import BiCGStab, tolerances_as_arrays
+from .krylov import BiCGStab, solve_system, tolerances_as_arrays
 from .precondition import AbstractPreconditioner, multigrid
 from .system import System, check_system, tolerance
 
@@ -168,9 +167,7 @@ class _Problem(eqx.Module):
         fixed, v = _constant((self, v))
         slope = _Slope(fixed.reaction, fixed.args, fixed.field(v))
         system = System(fixed.operator + Map(slope, len(v)), fixed.conditions)
-        options = {"preconditioner": Action(_constant(preconditioner), v.dtype)}
-        matrix = Action(system.matrix, v.dtype)
-        return lx.linear_solve(matrix, residual, solver, options=options, throw=False)
+        return solve_system(system.matrix, residual, solver, _constant(preconditioner))
 
 
 class _State(eqx.Module):

@@ -3,6 +3,7 @@ r"""Preconditioners: algebraic multigrid set up on the host, its cycle in JAX; a
 from __future__ import annotations
 
 import abc
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -18,7 +19,13 @@ from ..stencils.algebra import AbstractOperator, Composition
 from ..stencils.padded import PaddedMatrix
 from ..stencils.stencil import Stencil
 from . import aggregation, renewal
-from .reduced import annihilates_constants, check_kinds, free_operator, free_points, reduced_matrix
+from .reduced import (
+    annihilates_constants,
+    check_kinds,
+    free_operator,
+    reduced_matrix,
+    restriction_of,
+)
 
 # The coarsest system has at most this many unknowns and is solved by a dense inverse.
 _COARSEST = 400
@@ -210,11 +217,6 @@ class _Product(AbstractPreconditioner):
     outer: Any
     inner: Any
 
-    @classmethod
-    def of(cls, outer, inner):
-        mean_zero = bool(outer.mean_zero or inner.mean_zero)
-        return cls(mean_zero, outer, inner)
-
     @property
     def n(self):
         return self.outer.n
@@ -223,12 +225,13 @@ class _Product(AbstractPreconditioner):
         return self.inner(self.outer(r))
 
     def transpose(self):
-        return _Product.of(self.inner.transpose(), self.outer.transpose())
+        return _Product(self.mean_zero, self.inner.T, self.outer.T)
 
     def renewed(self, operator, *, conditions=None):
         instance(operator, Composition, "operator", "as the hierarchy was made for")
         pairs = (self.outer, operator.outer), (self.inner, operator.inner)
-        return _Product.of(*(p.renewed(o, conditions=conditions) for p, o in pairs))
+        both = (p.renewed(o, conditions=conditions) for p, o in pairs)
+        return _Product(self.mean_zero, *both)
 
 
 def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> Jacobi:
@@ -299,14 +302,15 @@ def multigrid(
     """
     check_kinds(operator, conditions)
     if isinstance(operator, Composition) and conditions is None:
-        both = operator.outer, operator.inner
-        return _Product.of(*(multigrid(o, single=single, renewable=renewable) for o in both))
+        make = functools.partial(multigrid, single=single, renewable=renewable)
+        outer, inner = make(operator.outer), make(operator.inner)
+        return _Product(bool(outer.mean_zero or inner.mean_zero), outer, inner)
     return _hierarchy(operator, conditions, single, renewable)
 
 
 def _hierarchy(operator, conditions, single: bool, renewable: bool) -> Multigrid:
     fine = reduced_matrix(operator, conditions)
-    free = free_points(operator, conditions)
+    free = restriction_of(operator, conditions).on_host
     mean_zero = annihilates_constants(fine, free)
     dtype = np.dtype(np.float32) if single else fine.dtype
     width = USED * operator.k if isinstance(operator, Stencil) else None
@@ -361,7 +365,7 @@ def _level(matrix, tentative, dtype, room: int, coarse: int, width, on):
 def _renewed(plan, operator, conditions, mean_zero: bool, dtype) -> Multigrid:
     matrix, restriction = free_operator(operator, conditions)
     below, free = renewal.free_divisor(operator, matrix, restriction)
-    if conditions is not None or operator.active is not None:
+    if not restriction.all_free:
         matrix, below = matrix + (1 - restriction), below + (1 - free)
     found, (dense,), constant = renewal.renewed_levels(
         plan, (matrix,), below, free, operator.active

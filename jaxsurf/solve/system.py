@@ -13,7 +13,7 @@ from ..boundary import Closure, Restriction, check_border
 from ..stencils.algebra import AbstractOperator, Composition
 from ..stencils.stencil import Stencil
 from .precondition import AbstractPreconditioner
-from .reduced import check_kinds, free_operator
+from .reduced import check_kinds, free_operator, restriction_of
 
 
 class System(eqx.Module):
@@ -50,9 +50,9 @@ class System(eqx.Module):
 
     @property
     def matrix(self) -> AbstractOperator:
-        matrix = self.reduced
-        if not self._all_free:
-            matrix = matrix + (1 - self.restriction)
+        matrix, restriction = free_operator(self.operator, self.conditions)
+        if not restriction.all_free:
+            matrix = matrix + (1 - restriction)
         return matrix if self.sigma is None else matrix - self.sigma * self.averaging
 
     def inverse(self, preconditioner: AbstractPreconditioner) -> AbstractOperator:
@@ -65,16 +65,12 @@ class System(eqx.Module):
     @property
     def restriction(self) -> Restriction:
         """P."""
-        return Restriction(self.operator.n, self.conditions, self.operator.active)
+        return restriction_of(self.operator, self.conditions)
 
     @property
     def averaging(self) -> Averaging:
         """p pᵀ / pᵀ p."""
         return Averaging(self.restriction)
-
-    @property
-    def _all_free(self) -> bool:
-        return self.conditions is None and self.operator.active is None
 
     def spread(self) -> Float[Array, "*n"]:
         """One over half the row sums of moduli: the square of a distance for a Laplacian."""

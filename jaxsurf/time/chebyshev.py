@@ -24,6 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from .states import dtype_of
+
 Loop = Literal["checkpointed", "lax", "bounded"]
 
 # Damping of the stability polynomial: the strip around the negative real axis that it covers.
@@ -82,8 +84,7 @@ def last_stage(
         max_stages: the largest number there may be.
         loop: how it can be differentiated, see `RKC2`.
     """
-    dtype = jnp.result_type(*jax.tree.leaves(y0))
-    rows = jnp.asarray(table(max_stages), dtype)[stages]
+    rows = jnp.asarray(table(max_stages), dtype_of(y0))[stages]
     if loop == "checkpointed":
         increment = eqx.filter_closure_convert(increment, rows[0, _NODE], y0)
         return _last((increment, y0, k0), rows, stages)

@@ -47,8 +47,7 @@ def frozen(tree: PyTree) -> PyTree:
 def small(y: PyTree[Array]) -> Float[Array, ""]:
     """The length of a step for differences at a state, in the scale of the state."""
     size = length(y)
-    dtype = jnp.result_type(*jax.tree.leaves(y))
-    return jnp.sqrt(jnp.finfo(dtype).eps) * jnp.where(size > 0, size, 1)
+    return jnp.sqrt(jnp.finfo(dtype_of(y)).eps) * jnp.where(size > 0, size, 1)
 
 
 def dtype_of(y: PyTree[Array]):

@@ -9,13 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .adapt import (
-    dominance,
-    first_slots,
-    is_better,
-    share_wanted,
-    sizes_to_try,
-)
+from .adapt import dominance, first_slots, is_better, share_wanted, sizes_to_try
 from .adapt import residual_tolerance as residual_tolerance
 from .arguments import as_many, instance
 from .arguments import mask as checked_mask

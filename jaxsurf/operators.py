@@ -76,10 +76,7 @@ def surface_gradient(
     (Singh et al. 2023, eqs. 9 and 11; Suchde and Kuhnert 2019, eqs. 16 to 21.)
 
     Args:
-        cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
-        method: how the weights are computed.
-        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+        cloud, neighbors, method, throw: as for `laplace_beltrami`.
 
     Returns:
         Operator mapping `(n, *c)` fields to `(n, *c, d)`, in units of field / length.
@@ -114,10 +111,7 @@ def surface_divergence(
     $(\nabla_S\cdot n)\,v\cdot n$, as on a moving surface.
 
     Args:
-        cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
-        method: how the weights are computed.
-        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+        cloud, neighbors, method, throw: as for `laplace_beltrami`.
 
     Returns:
         Operator mapping `(n, *c, d)` fields to `(n, *c)`, in units of field / length.
@@ -151,11 +145,8 @@ def directional_derivative(
     r"""Derivative $a \cdot \nabla_S u$ along a vector field a; its normal part does not count.
 
     Args:
-        cloud: n points in d dimensions with unit normals.
         direction: a, `(n, d)` or `(d,)`; its length scales the derivative.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
-        method: how the weights are computed.
-        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+        cloud, neighbors, method, throw: as for `laplace_beltrami`.
 
     Returns:
         Operator mapping `(n, *c)` fields to the same shape.
@@ -202,12 +193,9 @@ def diffusion(
     Laplacian times the mean of D, which inherit their signs.
 
     Args:
-        cloud: n points in d dimensions with unit normals.
         diffusivity: D, scalar `(n,)` or symmetric tensor `(n, d, d)`, neither negative; of a
             tensor only the tangential part counts. Taken in the precision of the cloud.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
-        method: how the weights are computed.
-        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+        cloud, neighbors, method, throw: as for `laplace_beltrami`.
 
     Returns:
         Operator mapping `(n, *c)` fields to the same shape.
@@ -292,10 +280,7 @@ def biharmonic(
     r"""Bi-Laplacian $\Delta_S^2$, the Laplace–Beltrami operator applied twice.
 
     Args:
-        cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
-        method: how the weights are computed.
-        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+        cloud, neighbors, method, throw: as for `laplace_beltrami`.
 
     Returns:
         Operator mapping `(n, *c)` fields to the same shape, in units of field / length⁴.

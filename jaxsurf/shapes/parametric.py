@@ -133,10 +133,7 @@ def graph(
         >>> bump.n, int(bump.boundary.sum()), bool((bump.normals[:, 2] > 0).all())
         (600, 96, True)
     """
-    box = in_range(on_host(bounds, "bounds"), "bounds")
-    if box.shape != (2, 2):
-        raise ValueError(f"bounds must be two corners in the plane, shape (2, 2), not {box.shape}")
-    (x0, y0), (x1, y1) = box
+    (x0, y0), (x1, y1) = in_range(on_host(bounds, "bounds", (2, 2)), "bounds")
     if not (x1 > x0 and y1 > y0):
         raise ValueError(f"upper corner {bounds[1]} must exceed lower corner {bounds[0]}")
     dtype = jnp.result_type(float)
@@ -191,8 +188,8 @@ def _height(f: Traced, points):
 
 
 def _interval(interval) -> tuple[float, float]:
-    ends = on_host(interval, "interval")
-    if ends.shape != (2,) or not np.isfinite(ends).all():
+    ends = on_host(interval, "interval", (2,))
+    if not np.isfinite(ends).all():
         raise ValueError(f"interval is {interval}, expected two finite numbers")
     if not ends[1] > ends[0]:
         raise ValueError(f"interval {interval} is empty")

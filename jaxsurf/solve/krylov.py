@@ -183,14 +183,11 @@ class _Run(eqx.Module):
         x, r, v, alpha, omega = jax.lax.fori_loop(0, 2, half, start)
         size = jnp.linalg.norm(r)
         # The shadow residual has to see the residual, and omega must not vanish.
-        seen = jnp.abs(rho) > _eps(r) * jnp.linalg.norm(self.shadow) * self.size
+        eps = jnp.finfo(r.dtype).eps
+        seen = jnp.abs(rho) > eps * jnp.linalg.norm(self.shadow) * self.size
         sound = jnp.isfinite(size) & seen
         keep = lambda new, old: jnp.where(sound, new, old)
         return _Run(
             keep(x, self.x), keep(r, self.r), self.shadow, p, v, rho, alpha, omega,
             keep(size, self.size), self.steps + 1, sound & (omega != 0),
         )  # fmt: skip
-
-
-def _eps(x):
-    return jnp.finfo(x.dtype).eps

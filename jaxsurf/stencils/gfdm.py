@@ -77,8 +77,7 @@ class GFDM(AbstractMethod):
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
         plane = TangentPlane.of(neighborhood, self.degree, width=self.width, support=self.support)
         b = jnp.asarray(target.moments(len(plane.points), 1, self.degree), plane.points.dtype)
-        solved = moment_solve(plane.points, plane.weights, b, 1, self.degree)
-        eta, condition, residual = solved
+        eta, condition, residual = moment_solve(plane.points, plane.weights, b, 1, self.degree)
         eta = with_center(target.in_units(eta, plane.width, len(plane.points)))
         diagnostics = Diagnostics.of(neighborhood, condition, residual, plane.radius, 0)
         return target.assemble(eta, plane.tangents), diagnostics

@@ -21,6 +21,11 @@ def root_mean_square(y: PyTree[Array]) -> Float[Array, ""]:
     return length(y) / max(sum(leaf.size for leaf in jax.tree.leaves(y)), 1) ** 0.5
 
 
+def added(*trees: PyTree[Array]) -> PyTree[Array]:
+    """The sum of states, or of rates."""
+    return jax.tree.map(lambda first, *others: sum(others, first), *trees)
+
+
 def only_on(active: Bool[Array | np.ndarray, " n"] | None, tree: PyTree) -> PyTree:
     """A state or a rate with zeros in the rows of points that are switched off."""
     if active is None:

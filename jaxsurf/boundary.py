@@ -201,9 +201,7 @@ class Extension(AbstractOperator):
     in_shape = ()
     out_shape = ()
 
-    @property
-    def n(self):
-        return self.closure.n
+    n = property(lambda self: self.closure.n)
 
     def __call__(self, u):
         return self.closure.homogeneous(u)

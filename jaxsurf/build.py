@@ -97,7 +97,7 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     if border is not None and cloud.active is not None:
         border = border & cloud.active
     known = (diagnostics, border, cloud.active)
-    stencil = Stencil(_turned(neighbors.indices), values, components, (), *known)
+    stencil = Stencil(_slots_first(neighbors.indices), values, components, (), *known)
     if throw and is_concrete(values):
         _check(stencil, neighbors, method, target, cloud.dim)
     return stencil
@@ -131,7 +131,7 @@ def blocks_of(cloud, neighbors, rows, size: int):
 
 
 @copying_jit
-def _turned(indices):
+def _slots_first(indices):
     return indices.T
 
 

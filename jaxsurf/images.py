@@ -158,8 +158,8 @@ class _Across:
         carriers = np.where(shared[:, None], row, speaker[:, None])
         shares = np.where(shared[:, None], share, alone)
         step = 2 * inside[:, None] * conormal
-        turned = normals - 2 * np.einsum("pd,pd->p", normals, conormal)[:, None] * conormal
-        images = (points + step, turned, names, inside, condition, carriers, shares)
+        mirrored = normals - 2 * np.einsum("pd,pd->p", normals, conormal)[:, None] * conormal
+        images = (points + step, mirrored, names, inside, condition, carriers, shares)
         return Images(*(x[keep] for x in images))
 
 

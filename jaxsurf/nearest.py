@@ -239,18 +239,18 @@ def _merged(keys, size: int, first: bool = True):
     """Groups of a size put in order whose halves are; or, if not `first`, bitonic ones."""
     half = size // 2
     if first:
-        keys = _stage(keys, half, turned=True)
+        keys = _stage(keys, half, reverse=True)
         half //= 2
     while half:
-        keys = _stage(keys, half, turned=False)
+        keys = _stage(keys, half, reverse=False)
         half //= 2
     return keys
 
 
-def _stage(keys, half: int, turned: bool):
+def _stage(keys, half: int, reverse: bool):
     """The first half of every group against the second, and this if need be turned round."""
     parts = [a.reshape(-1, 2, half, *a.shape[1:]) for a in keys]
-    turn = (lambda a: a[:, ::-1]) if turned else (lambda a: a)
+    turn = (lambda a: a[:, ::-1]) if reverse else (lambda a: a)
     low, high = _exchanged([a[:, 0] for a in parts], [turn(a[:, 1]) for a in parts])
     return tuple(
         jnp.stack([a, turn(b)], axis=1).reshape(whole.shape) for a, b, whole in zip(low, high, keys)

@@ -171,32 +171,32 @@ def _warm(heat: Stencil, start, rtol: float):
     values = _relaxed(known, given, known.diagonal, jnp.abs, rtol)
     weights = heat.weights * (values[heat.indices] / values)
     # Zero; what is left of it is the derivative of the equation at its solution.
-    rest = start / values - Stencil(heat.indices, weights)(jnp.ones_like(values))
-    rest = rest - jax.lax.stop_gradient(rest)
-    return values * (1 + _zero(weights, rest, heat.indices, rtol))
+    residual = start / values - Stencil(heat.indices, weights)(jnp.ones_like(values))
+    residual = residual - jax.lax.stop_gradient(residual)
+    return values * (1 + _zero(weights, residual, heat.indices, rtol))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
-def _zero(weights, rest, indices, rtol: float):
+def _zero(weights, residual, indices, rtol: float):
     """The solution of a system whose right-hand side is zero: only its derivative is solved for."""
     del weights, indices, rtol
-    return jnp.zeros_like(rest)
+    return jnp.zeros_like(residual)
 
 
 @_zero.defjvp
 def _zero_jvp(rtol, primals, tangents):
-    weights, rest, indices = primals
-    d_weights, d_rest, _ = tangents
+    weights, residual, indices = primals
+    d_weights, d_residual, _ = tangents
     operator = Stencil(indices, weights)
     diagonal = jax.lax.stop_gradient(operator.diagonal)
-    nothing = _zero(weights, rest, indices, rtol)
+    nothing = _zero(weights, residual, indices, rtol)
 
     def solve(matvec, b):
         largest = lambda x: jnp.max(jnp.abs(x))
         return _relaxed(matvec, b, diagonal, largest, rtol)
 
-    d_rest = d_rest - Stencil(indices, d_weights)(nothing)
-    return nothing, jax.lax.custom_linear_solve(operator, d_rest, solve, solve)
+    d_residual = d_residual - Stencil(indices, d_weights)(nothing)
+    return nothing, jax.lax.custom_linear_solve(operator, d_residual, solve, solve)
 
 
 def _relaxed(operator: Callable, rhs, diagonal, size: Callable, rtol: float):

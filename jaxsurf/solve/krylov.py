@@ -106,10 +106,10 @@ class BiCGStab(lx.AbstractLinearSolver):
         return unravel(scale * x), result, {"num_steps": steps, "max_steps": self.max_steps}
 
     def transpose(self, state, options):
-        turned = {}
+        transposed = {}
         if "preconditioner" in options:
-            turned["preconditioner"] = options["preconditioner"].transpose()
-        return state.transpose(), turned
+            transposed["preconditioner"] = options["preconditioner"].transpose()
+        return state.transpose(), transposed
 
     def conj(self, state, options):
         return lx.conj(state), options

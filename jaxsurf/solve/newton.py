@@ -248,8 +248,8 @@ def _solve(problem, u0, preconditioner, solver, rtol, atol, max_steps, concrete,
 
 
 def _constant(tree):
-    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(jax.lax.stop_gradient(arrays), rest)
+    arrays, static = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.lax.stop_gradient(arrays), static)
 
 
 class _Slope(eqx.Module):

@@ -69,9 +69,7 @@ class Jacobi(AbstractPreconditioner):
 
     divisor: Float[Array, " n"]
 
-    @property
-    def n(self):
-        return len(self.divisor)
+    n = property(lambda self: len(self.divisor))
 
     def __call__(self, r):
         return r / self.divisor
@@ -85,7 +83,7 @@ class Level(eqx.Module):
 
     Args:
         matrix: the operator on this level.
-        turned: its transpose; None where that is at hand.
+        transposed: its transpose; None where that is at hand.
         inverse: of the diagonal.
         restrict: to the next coarser level.
         prolong: from there.
@@ -93,15 +91,13 @@ class Level(eqx.Module):
     """
 
     matrix: PaddedMatrix | AbstractOperator
-    turned: PaddedMatrix | AbstractOperator | None
+    transposed: PaddedMatrix | AbstractOperator | None
     inverse: Float[Array, " n"]
     restrict: PaddedMatrix
     prolong: PaddedMatrix
     damping: tuple[Float[Array, ""], ...]
 
-    @property
-    def n(self) -> int:
-        return self.inverse.shape[0]
+    n = property(lambda self: self.inverse.shape[0])
 
     def smooth(self, x, b):
         """The smoother from x. Its steps are a loop: the matrix is compiled once."""
@@ -122,8 +118,8 @@ class Level(eqx.Module):
     def T(self) -> Level:
         # The prolongation is the transposed restriction: both stay. So do polynomials in
         # D⁻¹A times D⁻¹, with A transposed.
-        turned = self.matrix.T if self.turned is None else self.turned  # type: ignore[union-attr]
-        return Level(turned, self.matrix, self.inverse, self.restrict, self.prolong, self.damping)
+        matrix = self.matrix.T if self.transposed is None else self.transposed  # type: ignore[union-attr]
+        return Level(matrix, self.matrix, self.inverse, self.restrict, self.prolong, self.damping)
 
 
 class Multigrid(AbstractPreconditioner):
@@ -144,9 +140,7 @@ class Multigrid(AbstractPreconditioner):
     coarsest: Float[Array, "m m"]
     plan: tuple[renewal.Coarsening, ...] | None = None
 
-    @property
-    def n(self):
-        return self.sizes[0]
+    n = property(lambda self: self.sizes[0])
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -217,9 +211,7 @@ class _Product(AbstractPreconditioner):
     outer: Any
     inner: Any
 
-    @property
-    def n(self):
-        return self.outer.n
+    n = property(lambda self: self.outer.n)
 
     def __call__(self, r):
         return self.inner(self.outer(r))
@@ -335,7 +327,7 @@ def _hierarchy(operator, conditions, single: bool, renewable: bool) -> Multigrid
     constant = np.append(constant, np.zeros(room - size))
     used = np.arange(room) < size
     coarsest = aggregation.dense_inverse(dense, used, constant if mean_zero else None).astype(dtype)
-    plan = renewal.plan_of(made, [(v.matrix, v.turned) for v in levels]) if renewable else None
+    plan = renewal.plan_of(made, [(v.matrix, v.transposed) for v in levels]) if renewable else None
     return Multigrid(mean_zero, tuple(levels), jnp.asarray(coarsest), plan)
 
 
@@ -373,7 +365,7 @@ def _renewed(plan, operator, conditions, mean_zero: bool, dtype) -> Multigrid:
     levels = tuple(
         Level(
             v.matrices[0],
-            v.turned[0],
+            v.transposed[0],
             renewal.inverted(v.divisor),
             v.restrict,
             v.prolong,

@@ -139,7 +139,7 @@ def _solve_one(rhs, operator, conditions, preconditioner, solver, limits, mean_z
     rtol, atol, given, project = limits
     system = System.of(operator, conditions, rhs.dtype, mean_zero)
     offset = jnp.zeros_like(rhs) if conditions is None else conditions.offset()
-    known = rhs if conditions is None else system.free(rhs - operator(offset))
+    known = rhs if conditions is None else system.restriction(rhs - operator(offset))
     inverse = jax.lax.stop_gradient(system.inverse(preconditioner))
     found = solve_system(system.matrix, known, solver, inverse)
     v = found.value

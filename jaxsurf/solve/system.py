@@ -39,7 +39,7 @@ class System(eqx.Module):
         if not mean_zero:
             return plain
         # σ of the size and sign that keep the new eigenvalue among the others.
-        signs = plain.free(1.0 - 2.0 * (jnp.arange(operator.n) % 2).astype(dtype))
+        signs = plain.restriction(1.0 - 2.0 * (jnp.arange(operator.n) % 2).astype(dtype))
         size = -jnp.vdot(signs, plain.reduced(signs)) / jnp.vdot(signs, signs)
         return cls(operator, conditions, jax.lax.stop_gradient(jnp.where(size == 0, 1, size)))
 
@@ -82,13 +82,9 @@ class System(eqx.Module):
         half = jnp.sum(jnp.abs(outer.weights), axis=0) / 2
         return 1 / jnp.where(half > 0, half, 1)
 
-    def free(self, v):
-        """P v."""
-        return self.restriction(v)
-
     def constant(self, value, dtype):
         """p times a number."""
-        return self.free(jnp.broadcast_to(jnp.asarray(value, dtype), self.operator.n))
+        return self.restriction(jnp.broadcast_to(jnp.asarray(value, dtype), self.operator.n))
 
     def mean(self, v):
         """Over free points."""
@@ -111,9 +107,7 @@ class Averaging(AbstractOperator):
     in_shape = ()
     out_shape = ()
 
-    @property
-    def n(self):
-        return self.restriction.n
+    n = property(lambda self: self.restriction.n)
 
     def mean(self, v):
         return jnp.sum(self.restriction(v)) / self.restriction.count

@@ -62,17 +62,9 @@ class GFDM(AbstractMethod):
     def basis_size(self, dim, target):
         return needed_polynomials(self.degree, dim, target)
 
-    @property
-    def batch_size(self):
-        return 256
-
-    @property
-    def polynomial_degree(self):
-        return max(self.degree, 2)
-
-    @property
-    def shares_moments(self):
-        return True
+    batch_size = 256
+    polynomial_degree = property(lambda self: max(self.degree, 2))
+    shares_moments = True
 
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
         plane = TangentPlane.of(neighborhood, self.degree, width=self.width, support=self.support)

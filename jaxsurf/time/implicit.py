@@ -186,8 +186,8 @@ class IMEX(_Implicit):
                 return jax.tree.map(lambda y, k: y - tableau.gamma * k, y, change)
 
             operator = lx.FunctionLinearOperator(left_side, jax.eval_shape(lambda: y0))
-            rest = jax.tree.map(jnp.subtract, known, operator.mv(start))
-            found = lx.linear_solve(operator, rest, solver, options=options, throw=False)
+            residual = jax.tree.map(jnp.subtract, known, operator.mv(start))
+            found = lx.linear_solve(operator, residual, solver, options=options, throw=False)
             y = jax.tree.map(jnp.add, start, found.value)
             return y, dfx.RESULTS.promote(found.result)
 

@@ -176,7 +176,7 @@ def at_time(value: InTime, name: str, t):
 
 
 def per_point(values: ArrayLike, field: Array, keep: int = 0) -> Array:
-    """Values `(n, *rest)`, `rest` of `keep` axes, with axes inserted to go with a field."""
+    """Values `(n, *kept)`, `keep` axes of them, with axes inserted to go with a field."""
     values = jnp.asarray(values)
     if values.ndim == 0:
         return values

@@ -133,9 +133,7 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         """True with a velocity."""
         return self.velocity is not None
 
-    @property
-    def diffusive(self):
-        return self.laplacian is not None
+    diffusive = property(lambda self: self.laplacian is not None)
 
     @property
     def contractive(self):

@@ -188,8 +188,8 @@ def _height(f: Traced, points):
 
 
 def _interval(interval) -> tuple[float, float]:
-    ends = on_host(interval, "interval", (2,))
-    if not np.isfinite(ends).all():
+    ends = on_host(interval, "interval")
+    if ends.shape != (2,) or not np.isfinite(ends).all():
         raise ValueError(f"interval is {interval}, expected two finite numbers")
     if not ends[1] > ends[0]:
         raise ValueError(f"interval {interval} is empty")

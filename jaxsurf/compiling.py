@@ -115,6 +115,11 @@ def block_by_block(function: Callable, dtype, *, rows: int = 4_096) -> Callable:
     return call
 
 
+def power_of_two(count: int) -> int:
+    """The next one: what sizes are rounded up to, so that few programs are compiled."""
+    return 1 << (count - 1).bit_length()
+
+
 def namespace(a):
     """NumPy for its arrays, else `jax.numpy`."""
     return np if isinstance(a, np.ndarray) else jnp

@@ -274,14 +274,8 @@ class Discretization(eqx.Module):
         cloud = moved_cloud(self.cloud, points, normals, lambda: self.gradient)
         if search is None:
             found_at = self.cloud.points if self.found_at is None else self.found_at
-            surface = Discretization(
-                cloud,
-                self.neighbors,
-                self.method,
-                self.border,
-                jax.lax.stop_gradient(found_at),
-                self.found,
-            )
+            lists = (self.neighbors, self.method, self.border, jax.lax.stop_gradient(found_at))
+            surface = Discretization(cloud, *lists, self.found)
         else:
             surface = self._renewed(cloud, search)
         if is_concrete(surface):

@@ -83,6 +83,11 @@ def numbers_as_arrays(tree: PyTree) -> PyTree:
     return jax.tree.map(array, tree)
 
 
+def constant(tree: PyTree) -> PyTree:
+    """The same values, constants to differentiation."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+
+
 class Program:
     """A jaxpr and the structure of its arguments and results, equal to others that do the same.
 

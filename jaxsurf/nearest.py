@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .cells import distance_key
 from .checks import stands_above
+from .compiling import power_of_two
 from .sheets import cosine_slack
 
 # Cells are a little wider than the reach, so that rounding puts no neighbour beyond them.
@@ -152,7 +153,7 @@ def nearest_in(
 
 def _nearest(grid, rows, k, reach, count, min_cosine, few) -> Nearest:
     d = len(grid.cells)
-    width = _power_of_two(k)
+    width = power_of_two(max(k, 2))
     count = max(-(-count // width), 2) * width
     place, candidates = grid.candidates(rows, reach, count)
     take = lambda column: column.at[place].get(mode="clip")
@@ -263,7 +264,3 @@ def _exchanged(a, b):
     swap = (a[0] > b[0]) | ((a[0] == b[0]) & (a[1] > b[1]))
     low = tuple(jnp.where(swap, y, x) for x, y in zip(a, b))
     return low, tuple(jnp.where(swap, x, y) for x, y in zip(a, b))
-
-
-def _power_of_two(k: int) -> int:
-    return 1 << max(k - 1, 1).bit_length()

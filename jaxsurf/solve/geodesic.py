@@ -6,7 +6,6 @@ import functools
 import math
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -237,10 +236,10 @@ def _shares(mask) -> Float[np.ndarray, "k n"]:
     return share / np.where(total > 0, total, 1)
 
 
-def _differences(indices, share, fixed) -> Stencil:
+def _differences(indices, share, fixed, table=None) -> Stencil:
     """Value less the mean of the others, between free points; the identity where it is known."""
     own = np.arange(len(share))[:, None] == 0
-    return Stencil(indices, own - share * ~(fixed | fixed[indices]))
+    return Stencil(indices, own - share * ~(fixed | fixed[indices]), table=table)
 
 
 def _preconditioner(indices, share, fixed, differentiated: bool):
@@ -260,9 +259,7 @@ def _integrate(x, normals, indices, share, direction, fixed, value, inverse, rto
 
     rhs, _ = jax.lax.scan(add_slot, jnp.zeros_like(value), (indices, share))
     preconditioner, table = inverse
-    operator = eqx.tree_at(
-        lambda s: s.table, _differences(indices, share, fixed), table, is_leaf=lambda x: x is None
-    )
+    operator = _differences(indices, share, fixed, table)
     found = solve_system(operator, jnp.where(fixed, 0, rhs), BiCGStab(rtol), preconditioner)
     free = refuse(
         found.value,

@@ -17,7 +17,7 @@ from ..arguments import as_float, finite, switched_off, whole
 from ..boundary import Closure
 from ..compiling import sized_jit
 from ..failures import is_concrete, refuse
-from ..functions import canonical, numbers_as_arrays
+from ..functions import canonical, constant, numbers_as_arrays
 from ..stencils.algebra import AbstractOperator, Map
 from ..stencils.stencil import prepared
 from .krylov import BiCGStab, solve_system, tolerances_as_arrays
@@ -164,10 +164,10 @@ class _Problem(eqx.Module):
 
     def correction(self, v, residual, preconditioner, solver):
         """The solution of (L + r') delta = residual; what it is linearised at is a constant."""
-        fixed, v = _constant((self, v))
+        fixed, v = constant((self, v))
         slope = _Slope(fixed.reaction, fixed.args, fixed.field(v))
         system = System(fixed.operator + Map(slope, len(v)), fixed.conditions)
-        return solve_system(system.matrix, residual, solver, _constant(preconditioner))
+        return solve_system(system.matrix, residual, solver, constant(preconditioner))
 
 
 class _State(eqx.Module):
@@ -181,7 +181,7 @@ class _State(eqx.Module):
 
 @sized_jit
 def _solve(problem, u0, preconditioner, solver, rtol, atol, max_steps, concrete, throw):
-    fixed = _constant(problem)
+    fixed = constant(problem)
     loose = BiCGStab(_FORCING, 0.0, 1000) if solver is None else solver
     start = fixed.residual(jax.lax.stop_gradient(u0))
     size = jnp.linalg.norm(start)
@@ -245,11 +245,6 @@ def _solve(problem, u0, preconditioner, solver, rtol, atol, max_steps, concrete,
         "relative_residual": state.size / jnp.where(scale > 0, scale, 1),
     }
     return optx.Solution(u, result, None, stats, None)
-
-
-def _constant(tree):
-    arrays, static = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(jax.lax.stop_gradient(arrays), static)
 
 
 class _Slope(eqx.Module):

@@ -1,4 +1,4 @@
-"""States in time as vectors: their size, and constants to differentiation."""
+"""States in time as vectors: sums, norms, types."""
 
 from __future__ import annotations
 
@@ -42,11 +42,6 @@ class Norm(eqx.Module):
     def __call__(self, y: PyTree[Array]) -> Float[Array, ""]:
         share = count_on(self.active, 0) / len(self.active)
         return root_mean_square(only_on(self.active, y)) / jnp.sqrt(share).astype(dtype_of(y))
-
-
-def frozen(tree: PyTree) -> PyTree:
-    """The same values, constants to differentiation."""
-    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
 def small(y: PyTree[Array]) -> Float[Array, ""]:

@@ -175,21 +175,14 @@ class Closure(eqx.Module):
 
     def to_scipy(self) -> scipy.sparse.csr_matrix:
         """E as a CSR matrix, `(n, n)`."""
-        rows, free = np.asarray(self.rows), self._host_free
-        own = np.flatnonzero(free)
-        i = np.concatenate([own, np.broadcast_to(rows, self.indices.shape).ravel()])
+        own = np.flatnonzero(self.restriction.on_host)
+        i = np.concatenate([own, np.broadcast_to(self.rows, self.indices.shape).ravel()])
         j = np.concatenate([own, np.asarray(self.indices).ravel()])
         weights = np.asarray(self.weights).ravel()
         values = np.concatenate([np.ones(len(own), weights.dtype), weights])
         matrix = scipy.sparse.csr_matrix((values, (i, j)), shape=(self.n, self.n))
         matrix.eliminate_zeros()
         return matrix
-
-    @property
-    def _host_free(self) -> Bool[np.ndarray, " n"]:
-        free = np.ones(self.n, bool)
-        free[np.asarray(self.rows)] = False
-        return free
 
     def _field(self, u):
         return as_float(u, "field", (self.n, ...))
@@ -208,9 +201,7 @@ class Extension(AbstractOperator):
     in_shape = ()
     out_shape = ()
 
-    @property
-    def n(self):
-        return self.closure.n
+    n = property(lambda self: self.closure.n)
 
     def __call__(self, u):
         return self.closure.homogeneous(u)
@@ -235,6 +226,19 @@ class Restriction(AbstractOperator):
     out_shape = ()
 
     @property
+    def all_free(self) -> bool:
+        """True if nothing is bound or switched off, so that P is the identity."""
+        return self.closure is None and self.on is None
+
+    @property
+    def on_host(self) -> Bool[np.ndarray, " n"]:
+        """Which points are free, as a NumPy array."""
+        free = np.ones(self.n, bool) if self.on is None else np.array(self.on)
+        if self.closure is not None:
+            free[np.asarray(self.closure.rows)] = False
+        return free
+
+    @property
     def count(self):
         """Number of free points."""
         return count_on(self.on, self.n) - (0 if self.closure is None else self.closure.m)
@@ -247,10 +251,8 @@ class Restriction(AbstractOperator):
         return self
 
     def to_scipy(self):
-        free = np.ones(self.n, bool) if self.closure is None else self.closure._host_free
-        free = free if self.on is None else free & np.asarray(self.on)
         dtype = float if self.closure is None else self.closure.weights.dtype
-        return scipy.sparse.diags(free.astype(dtype)).tocsr()
+        return scipy.sparse.diags(self.on_host.astype(dtype)).tocsr()
 
 
 def _components(given) -> tuple[int, ...]:

@@ -10,13 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .adapt import (
-    dominance,
-    first_slots,
-    is_better,
-    share_wanted,
-    sizes_to_try,
-)
+from .adapt import dominance, first_slots, is_better, share_wanted, sizes_to_try
 from .adapt import residual_tolerance as residual_tolerance
 from .arguments import as_many, instance
 from .arguments import mask as checked_mask
@@ -106,7 +100,7 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     known = (diagnostics, border, cloud.active)
     # Lists that are known stay known in compiled code: transposes can gather there.
     with at_once() if is_concrete(neighbors.indices) else nullcontext():
-        slots = _turned(neighbors.indices)
+        slots = _slots_first(neighbors.indices)
     stencil = Stencil(slots, values, components, (), *known)
     if throw and is_concrete(values):
         _check(stencil, neighbors, method, target, cloud.dim)
@@ -141,7 +135,7 @@ def blocks_of(cloud, neighbors, rows, size: int):
 
 
 @copying_jit
-def _turned(indices):
+def _slots_first(indices):
     return indices.T
 
 

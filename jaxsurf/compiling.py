@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .arguments import is_array
 from .failures import is_concrete
 
 if TYPE_CHECKING:
@@ -59,8 +60,8 @@ def sized_jit(f: Callable) -> Callable:
     @functools.wraps(f)
     def call(*args):
         leaves, structure = jax.tree.flatten(args)
-        arrays = [a if _is_array(a) else None for a in leaves]
-        others = tuple(None if _is_array(a) else a for a in leaves)
+        arrays = [a if is_array(a) else None for a in leaves]
+        others = tuple(None if is_array(a) else a for a in leaves)
         if _takes_longer_to_compile(leaves):
             try:
                 return quick(arrays, others, structure)
@@ -81,7 +82,7 @@ def copying_jit(f: Callable) -> Callable:
     @functools.wraps(f)
     def call(*args):
         if _takes_longer_to_compile(jax.tree.leaves(args)):
-            found = f(*jax.tree.map(lambda a: np.asarray(a) if _is_array(a) else a, args))
+            found = f(*jax.tree.map(lambda a: np.asarray(a) if is_array(a) else a, args))
             return jax.tree.map(jax.device_put, found)
         return compiled(*args)
 
@@ -114,18 +115,19 @@ def block_by_block(function: Callable, dtype, *, rows: int = 4_096) -> Callable:
     return call
 
 
+def power_of_two(count: int) -> int:
+    """The next one: what sizes are rounded up to, so that few programs are compiled."""
+    return 1 << (count - 1).bit_length()
+
+
 def namespace(a):
     """NumPy for its arrays, else `jax.numpy`."""
     return np if isinstance(a, np.ndarray) else jnp
 
 
-def _is_array(a) -> bool:
-    return isinstance(a, jax.Array | np.ndarray)
-
-
 def _takes_longer_to_compile(leaves: list) -> bool:
     """Whether a program of these arguments is taken to be compiled for longer than it runs."""
-    small = sum(a.size for a in leaves if _is_array(a)) < _SMALL
+    small = sum(a.size for a in leaves if is_array(a)) < _SMALL
     return small and is_concrete(*leaves) and _is_known()
 
 

@@ -286,15 +286,12 @@ def _check_agreement(conditions, number, owner, place) -> None:
 
 def _differ(one: Condition, i, two: Condition, j) -> Bool[np.ndarray, " p"]:
     """Whether two conditions differ at p points: points i of the first, j of the second."""
-    everywhere, nowhere = np.ones(len(i), bool), np.zeros(len(i), bool)
-    if one.is_free != two.is_free or (one.b is None) != (two.b is None):
+    everywhere, result = np.ones(len(i), bool), np.zeros(len(i), bool)
+    kinds = [(c.is_free, c.b is None, c.conormals is None) for c in (one, two)]
+    if kinds[0] != kinds[1]:
         return everywhere
-    if (one.conormals is None) != (two.conormals is None):
+    if one.value is not two.value and (callable(one.value) or callable(two.value)):
         return everywhere
-    if callable(one.value) or callable(two.value):
-        if one.value is not two.value:
-            return everywhere
-    result = nowhere
     for name in ("a", "b", "value", "conormals"):
         x, y = getattr(one, name), getattr(two, name)
         if x is y and not (name in ("value", "conormals") and np.ndim(x)):

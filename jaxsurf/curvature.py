@@ -49,8 +49,7 @@ def shape_tensor(
         >>> bool(jnp.abs(js.shape_tensor(cloud)[0] - 0.5 * tangent).max() < 0.02)
         True
     """
-    gradient = surface_gradient(cloud, neighbors, method=method)
-    return tensor_of(gradient, cloud.normals)
+    return tensor_of(surface_gradient(cloud, neighbors, method=method), cloud.normals)
 
 
 @sized_jit
@@ -74,9 +73,7 @@ def mean_curvature(
     For curves in the plane (d = 2) it is their curvature.
 
     Args:
-        cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
-        method: how derivatives are computed.
+        cloud, neighbors, method: as for `shape_tensor`.
 
     Returns:
         `(n,)`, in units of 1 / length; +1 on the unit sphere with outward normals.
@@ -90,8 +87,7 @@ def mean_curvature(
         >>> bool(jnp.abs(js.mean_curvature(js.sphere(2_000, radius=2.0)) - 0.5).max() < 0.01)
         True
     """
-    tensor = shape_tensor(cloud, neighbors, method=method)
-    return mean_of(tensor)
+    return mean_of(shape_tensor(cloud, neighbors, method=method))
 
 
 @jax.jit
@@ -109,9 +105,7 @@ def gauss_curvature(
     r"""Gauss curvature, the product of the principal curvatures.
 
     Args:
-        cloud: n points in three dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
-        method: how derivatives are computed.
+        cloud, neighbors, method: as for `shape_tensor`, d = 3.
 
     Returns:
         `(n,)`, in units of 1 / length².
@@ -125,8 +119,7 @@ def gauss_curvature(
         >>> bool(jnp.abs(js.gauss_curvature(js.sphere(300, radius=2.0)) - 0.25).max() < 0.02)
         True
     """
-    a = _in_tangent_plane(cloud, neighbors, method)[0]
-    return gauss_of(a)
+    return gauss_of(_in_tangent_plane(cloud, neighbors, method)[0])
 
 
 @jax.jit
@@ -144,9 +137,7 @@ def principal_curvatures(
     r"""Principal curvatures and directions: eigenvalues and eigenvectors of the shape tensor.
 
     Args:
-        cloud: n points in three dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
-        method: how derivatives are computed.
+        cloud, neighbors, method: as for `shape_tensor`, d = 3.
 
     Returns:
         The curvatures, smaller first, `(n, 2)`, and the unit directions, one per row,
@@ -191,9 +182,7 @@ def mean_curvature_vector(
     r"""Mean curvature vector $\Delta_S x = -(d-1) H n$, the Laplacian of the positions.
 
     Args:
-        cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
-        method: how derivatives are computed.
+        cloud, neighbors, method: as for `shape_tensor`.
 
     Returns:
         `(n, d)`, in units of 1 / length; it points to the inside of a sphere.

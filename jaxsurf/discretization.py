@@ -105,12 +105,8 @@ class Discretization(eqx.Module):
     def _joint(self) -> tuple[Stencil, Stencil]:
         """Laplacian and gradient from one factorisation of the moment matrices."""
         both = self._build(Joint((Laplacian(), Gradient())))
-        known = (both.diagnostics, both.border, both.active)
         laplacian, gradient = _first_and_others(both.weights)
-        return (
-            Stencil(both.indices, laplacian, (), (), *known),
-            Stencil(both.indices, gradient, (self.cloud.dim,), (), *known),
-        )
+        return both.of_weights(laplacian), both.of_weights(gradient, (self.cloud.dim,))
 
     @Kept
     def _laplacian(self) -> Stencil:
@@ -278,14 +274,8 @@ class Discretization(eqx.Module):
         cloud = moved_cloud(self.cloud, points, normals, lambda: self.gradient)
         if search is None:
             found_at = self.cloud.points if self.found_at is None else self.found_at
-            surface = Discretization(
-                cloud,
-                self.neighbors,
-                self.method,
-                self.border,
-                jax.lax.stop_gradient(found_at),
-                self.found,
-            )
+            lists = (self.neighbors, self.method, self.border, jax.lax.stop_gradient(found_at))
+            surface = Discretization(cloud, *lists, self.found)
         else:
             surface = self._renewed(cloud, search)
         if is_concrete(surface):
@@ -300,7 +290,7 @@ class Discretization(eqx.Module):
         surface = Discretization(cloud, neighbors, search.method, self.border, found=found)
         name = "_joint" if search.method.shares_moments else "_laplacian"
         kept = operators if search.method.shares_moments else operators[0]
-        object.__setattr__(surface, "_kept", {name: kept})
+        vars(surface)["_kept"] = {name: kept}
         return surface
 
     @Kept

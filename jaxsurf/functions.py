@@ -48,12 +48,12 @@ def canonical(f: Callable, *examples: Any) -> Traced:
         examples: one for each argument. Arrays and numbers become arguments of the program; all
             else (text, True and False) is a part of it.
     """
-    leaves, rest = eqx.partition((f, numbers_as_arrays(examples)), eqx.is_array)
+    leaves, static = eqx.partition((f, numbers_as_arrays(examples)), eqx.is_array)
     flat, structure = jax.tree.flatten(leaves)
     results = []
 
     def run(*flat):
-        f, args = eqx.combine(jax.tree.unflatten(structure, flat), rest)
+        f, args = eqx.combine(jax.tree.unflatten(structure, flat), static)
         out, result = jax.tree.flatten(f(*args))
         results.append(result)
         return out
@@ -66,7 +66,7 @@ def canonical(f: Callable, *examples: Any) -> Traced:
     constants = [*closed.consts, *numbers, *flat[:own]]
     used = [i for i in range(len(constants)) if inputs[i] in kept]
     order = tuple(used), tuple(range(len(constants), len(inputs)))
-    program = Program(jaxpr, order, _structure(leaves[1], rest[1]), results[0])
+    program = Program(jaxpr, order, _structure(leaves[1], static[1]), results[0])
     return Traced([jnp.asarray(constants[i]) for i in used], program)
 
 
@@ -81,6 +81,11 @@ def numbers_as_arrays(tree: PyTree) -> PyTree:
         return jnp.asarray(leaf) if number or isinstance(leaf, np.ndarray) else leaf
 
     return jax.tree.map(array, tree)
+
+
+def constant(tree: PyTree) -> PyTree:
+    """The same values, constants to differentiation."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
 class Program:
@@ -98,8 +103,8 @@ class Program:
         self._hash = hash(self._key)
 
     def run(self, constants, args):
-        leaves, rest = eqx.partition(numbers_as_arrays(args), eqx.is_array)
-        if (taken := _structure(leaves, rest)) != self._taken:
+        leaves, static = eqx.partition(numbers_as_arrays(args), eqx.is_array)
+        if (taken := _structure(leaves, static)) != self._taken:
             raise ValueError(f"arguments {taken}, the program was made for {self._taken}")
         # What is not read may be anything.
         inputs: list[Any] = [None] * (len(self._jaxpr.constvars) + len(self._jaxpr.invars))
@@ -140,10 +145,10 @@ def _without_numbers(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:
     return jaxpr.replace(eqns=equations, constvars=[*jaxpr.constvars, *names]), numbers
 
 
-def _structure(leaves: PyTree, rest: PyTree) -> tuple:
+def _structure(leaves: PyTree, static: PyTree) -> tuple:
     """Of arguments, with what in them is no array."""
     shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(leaves)]
-    return jax.tree.structure(leaves), tuple(shapes), _frozen(jax.tree.leaves(rest))
+    return jax.tree.structure(leaves), tuple(shapes), _frozen(jax.tree.leaves(static))
 
 
 def _read(jaxpr: Jaxpr) -> set:

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from .arguments import real
 from .borders.border import Border
 from .cloud import PointCloud
+from .compiling import power_of_two
 
 # An image closer than this share of the spacing to another point is left out (not a half: on a
 # lattice the last bit would decide).
@@ -134,7 +135,7 @@ class _Across:
         if not len(slot):
             return Images.none(points, self.border.rows.shape[2])
         # Filled up with copies, so that few shapes are ever compiled.
-        fill = np.arange(max(64, 1 << (len(slot) - 1).bit_length())) % len(slot)
+        fill = np.arange(max(64, power_of_two(len(slot)))) % len(slot)
         found = self.border.at(self.cloud, side[fill], slot[fill], jnp.asarray(points[fill]))
         foot, _, conormal, share = (np.asarray(x)[: len(slot)] for x in found)
         inside = -np.einsum("pd,pd->p", points - foot, conormal)
@@ -158,8 +159,8 @@ class _Across:
         carriers = np.where(shared[:, None], row, speaker[:, None])
         shares = np.where(shared[:, None], share, alone)
         step = 2 * inside[:, None] * conormal
-        turned = normals - 2 * np.einsum("pd,pd->p", normals, conormal)[:, None] * conormal
-        images = (points + step, turned, names, inside, condition, carriers, shares)
+        mirrored = normals - 2 * np.einsum("pd,pd->p", normals, conormal)[:, None] * conormal
+        images = (points + step, mirrored, names, inside, condition, carriers, shares)
         return Images(*(x[keep] for x in images))
 
 

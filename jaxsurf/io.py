@@ -191,13 +191,7 @@ def _fitted_normals(path, mesh: TriangleMesh, degree: int) -> np.ndarray:
             f"{len(mesh.vertices)} vertices, normals of degree {degree} need at least"
             f" {need}: lower the degree or take smooth=False"
         )
-    _, normals, used = fit_surface(
-        mesh.vertices,
-        mesh.vertex_normals,
-        vertices=mesh.vertices,
-        vertex_normals=mesh.vertex_normals,
-        degree=degree,
-    )
+    _, normals, used = fit_surface(mesh.vertices, mesh.vertex_normals, mesh, degree)
     low = np.count_nonzero(used < degree)
     if low:
         warnings.warn(

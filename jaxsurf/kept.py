@@ -21,10 +21,7 @@ class Kept:
     def __get__(self, owner, kind=None):
         if owner is None:
             return self
-        kept = owner.__dict__.get("_kept")
-        if kept is None:
-            kept = {}
-            object.__setattr__(owner, "_kept", kept)
+        kept = vars(owner).setdefault("_kept", {})
         if self.name in kept:
             return kept[self.name]
         if not is_concrete(owner):

@@ -102,14 +102,14 @@ def folded(cloud, neighbors):
     """Whether the normal of a neighbour next to a point points to the other side."""
     points, normals = cloud.points, cloud.normals
 
-    def turned(found, slot):
+    def opposite(found, slot):
         index, used = slot
         return found | (used & (jnp.sum(normals[index] * normals, axis=1) < 0)), None
 
     # Of those farther away, other lists would leave out what has turned.
     ring = 2 * points.shape[1] + 1
     lists = (neighbors.indices[:, 1:ring].T, neighbors.mask[:, 1:ring].T)
-    return jax.lax.scan(turned, jnp.zeros(len(points), bool), lists)[0]
+    return jax.lax.scan(opposite, jnp.zeros(len(points), bool), lists)[0]
 
 
 @jax.jit

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .cells import distance_key
 from .checks import stands_above
+from .compiling import power_of_two
 from .sheets import cosine_slack
 
 # Cells are a little wider than the reach, so that rounding puts no neighbour beyond them.
@@ -152,7 +153,7 @@ def nearest_in(
 
 def _nearest(grid, rows, k, reach, count, min_cosine, few) -> Nearest:
     d = len(grid.cells)
-    width = _power_of_two(k)
+    width = power_of_two(max(k, 2))
     count = max(-(-count // width), 2) * width
     place, candidates = grid.candidates(rows, reach, count)
     take = lambda column: column.at[place].get(mode="clip")
@@ -239,18 +240,18 @@ def _merged(keys, size: int, first: bool = True):
     """Groups of a size put in order whose halves are; or, if not `first`, bitonic ones."""
     half = size // 2
     if first:
-        keys = _stage(keys, half, turned=True)
+        keys = _stage(keys, half, reverse=True)
         half //= 2
     while half:
-        keys = _stage(keys, half, turned=False)
+        keys = _stage(keys, half, reverse=False)
         half //= 2
     return keys
 
 
-def _stage(keys, half: int, turned: bool):
+def _stage(keys, half: int, reverse: bool):
     """The first half of every group against the second, and this if need be turned round."""
     parts = [a.reshape(-1, 2, half, *a.shape[1:]) for a in keys]
-    turn = (lambda a: a[:, ::-1]) if turned else (lambda a: a)
+    turn = (lambda a: a[:, ::-1]) if reverse else (lambda a: a)
     low, high = _exchanged([a[:, 0] for a in parts], [turn(a[:, 1]) for a in parts])
     return tuple(
         jnp.stack([a, turn(b)], axis=1).reshape(whole.shape) for a, b, whole in zip(low, high, keys)
@@ -263,7 +264,3 @@ def _exchanged(a, b):
     swap = (a[0] > b[0]) | ((a[0] == b[0]) & (a[1] > b[1]))
     low = tuple(jnp.where(swap, y, x) for x, y in zip(a, b))
     return low, tuple(jnp.where(swap, x, y) for x, y in zip(a, b))
-
-
-def _power_of_two(k: int) -> int:
-    return 1 << max(k - 1, 1).bit_length()

@@ -10,16 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.spatial import cKDTree
 
-from .arguments import (
-    POINTS,
-    as_float,
-    as_many,
-    in_range,
-    instance,
-    mask,
-    switched_off,
-    whole,
-)
+from .arguments import POINTS, as_float, as_many, in_range, instance, mask, switched_off, whole
 from .checks import check_count, check_spacing
 from .cloud import PointCloud
 from .compiling import sized_jit
@@ -50,10 +41,8 @@ def from_points(
 
     Args:
         points: n points in d = 2 or 3 dimensions, concrete.
-        degree: polynomial degree of the local fits; that of the operators to be used.
+        degree, k: as for `estimate_normals`; the degree that of the operators to be used.
         boundary: True for points on a border of the surface, `(n,)`.
-        k: number of neighbours in a fit; two (curves) or three (surfaces) times
-            the number of its coefficients if None.
 
     Returns:
         The points, in the order given, with the normals from `estimate_normals`.

@@ -76,10 +76,7 @@ def surface_gradient(
     (Singh et al. 2023, eqs. 9 and 11; Suchde and Kuhnert 2019, eqs. 16 to 21.)
 
     Args:
-        cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
-        method: how the weights are computed.
-        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+        cloud, neighbors, method, throw: as for `laplace_beltrami`.
 
     Returns:
         Operator mapping `(n, *c)` fields to `(n, *c, d)`, in units of field / length.
@@ -114,10 +111,7 @@ def surface_divergence(
     $(\nabla_S\cdot n)\,v\cdot n$, as on a moving surface.
 
     Args:
-        cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
-        method: how the weights are computed.
-        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+        cloud, neighbors, method, throw: as for `laplace_beltrami`.
 
     Returns:
         Operator mapping `(n, *c, d)` fields to `(n, *c)`, in units of field / length.
@@ -137,8 +131,7 @@ def surface_divergence(
 
 def divergence_of(gradient: Stencil) -> Stencil:
     """The divergence, which has the weights of the gradient."""
-    known = (gradient.diagnostics, gradient.border, gradient.active)
-    return Stencil(gradient.indices, gradient.weights, (), gradient.out_shape, *known)
+    return gradient.of_weights(gradient.weights, in_shape=gradient.out_shape)
 
 
 def directional_derivative(
@@ -152,11 +145,8 @@ def directional_derivative(
     r"""Derivative $a \cdot \nabla_S u$ along a vector field a; its normal part does not count.
 
     Args:
-        cloud: n points in d dimensions with unit normals.
         direction: a, `(n, d)` or `(d,)`; its length scales the derivative.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
-        method: how the weights are computed.
-        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+        cloud, neighbors, method, throw: as for `laplace_beltrami`.
 
     Returns:
         Operator mapping `(n, *c)` fields to the same shape.
@@ -182,9 +172,7 @@ def along(gradient: Stencil, direction: Float[Array, "*n d"]) -> Stencil:
     """The derivative along a vector field, from the gradient."""
     direction = _field(direction, (gradient.n, *gradient.out_shape), "direction")
     direction = finite(direction, "direction", gradient.active).astype(gradient.weights.dtype)
-    weights = _along(switched_off(gradient.active, direction), gradient.weights)
-    known = (gradient.diagnostics, gradient.border, gradient.active)
-    return Stencil(gradient.indices, weights, (), (), *known)
+    return gradient.of_weights(_along(switched_off(gradient.active, direction), gradient.weights))
 
 
 def diffusion(
@@ -205,12 +193,9 @@ def diffusion(
     Laplacian times the mean of D, which inherit their signs.
 
     Args:
-        cloud: n points in d dimensions with unit normals.
         diffusivity: D, scalar `(n,)` or symmetric tensor `(n, d, d)`, neither negative; of a
             tensor only the tangential part counts. Taken in the precision of the cloud.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
-        method: how the weights are computed.
-        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+        cloud, neighbors, method, throw: as for `laplace_beltrami`.
 
     Returns:
         Operator mapping `(n, *c)` fields to the same shape.
@@ -234,9 +219,7 @@ def diffusion(
     stencil = build(cloud, neighbors, method, Laplacian() if scalar else Hessian(), throw)
     weigh = _scalar_weights if scalar else _tensor_weights
     d = switched_off(cloud.active, d.astype(stencil.weights.dtype))
-    weights = weigh(d, cloud.seen.normals, stencil.indices, stencil.weights)
-    known = (stencil.diagnostics, stencil.border, stencil.active)
-    return Stencil(stencil.indices, weights, (), (), *known)
+    return stencil.of_weights(weigh(d, cloud.seen.normals, stencil.indices, stencil.weights))
 
 
 def _checked_diffusivity(diffusivity, cloud) -> Float[Array, "*n"]:
@@ -297,10 +280,7 @@ def biharmonic(
     r"""Bi-Laplacian $\Delta_S^2$, the Laplace–Beltrami operator applied twice.
 
     Args:
-        cloud: n points in d dimensions with unit normals.
-        neighbors: from `find_neighbors`; chosen by `choose_neighbors` if None (not under `jit`).
-        method: how the weights are computed.
-        throw: raise on a degenerate stencil; if False, see `Stencil.diagnostics`.
+        cloud, neighbors, method, throw: as for `laplace_beltrami`.
 
     Returns:
         Operator mapping `(n, *c)` fields to the same shape, in units of field / length⁴.

@@ -209,8 +209,8 @@ def _check_arguments(cloud, cmap, limits, pixels) -> None:
         if cmap not in colormaps:
             raise ValueError(f"cmap is {cmap!r}, expected the name of a colour map of matplotlib")
     if limits is not None:
-        ends = on_host(limits, "limits")
-        if ends.shape != (2,) or not ends[0] < ends[1] or not np.isfinite(ends).all():
+        ends = on_host(limits, "limits", (2,))
+        if not (ends[0] < ends[1] and np.isfinite(ends).all()):
             raise ValueError(f"limits are {limits}, expected 2 numbers, the smaller one first")
 
 

@@ -104,8 +104,8 @@ def _front(pixel, point, far, depth, *, side, radius, size: int):
     for _ in range(4):
         foremost = np.full(2 * size, -np.inf, np.float32)
         core = far < 0.36
-        turned = pixel[core] + size * (side[point[core]] < 0)
-        np.maximum.at(foremost, turned, depth[core])
+        place = pixel[core] + size * (side[point[core]] < 0)
+        np.maximum.at(foremost, place, depth[core])
         front = foremost.reshape(2, size)
         behind = front[1] > front[0] + np.float32(0.7 * np.median(radius))
         # Across the horizon both sides of a sheet belong together, elsewhere they are two.
@@ -120,10 +120,10 @@ def _front(pixel, point, far, depth, *, side, radius, size: int):
         solid = solid[pixel]
         take = seen & solid
         found.append((pixel[take], point[take], share[take] / weight[pixel[take]]))
-        rest = ~solid & ~seen
-        if not rest.any():
+        unseen = ~solid & ~seen
+        if not unseen.any():
             break
-        pixel, point, far, depth = pixel[rest], point[rest], far[rest], depth[rest]
+        pixel, point, far, depth = pixel[unseen], point[unseen], far[unseen], depth[unseen]
     return tuple(np.concatenate(parts) for parts in zip(*found))
 
 

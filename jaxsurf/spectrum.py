@@ -98,12 +98,12 @@ def spectral_estimate(operator: AbstractOperator, *, steps: int = 40, degree: in
 
     def damped(i):
         found = search.best(i)
-        rest = lambda v: v - found @ (found.T @ v)
+        deflated = lambda v: v - found @ (found.T @ v)
         filter_ = _ellipse(search.values[i:], hull, steps // 4, degree)
         if filter_ is None:
             return search.residual(i)
         x = search.vector(i)
-        return _chebyshev(lambda v: rest(apply(v)), rest(x), *filter_)
+        return _chebyshev(lambda v: deflated(apply(v)), deflated(x), *filter_)
 
     residual = search.run([_RIGHT] + 3 * [_NEXT], damped)
     value = search.values[0]

@@ -229,13 +229,7 @@ def test_distance_to_the_smooth_surface(axes):
         mesh = ball_mesh(n, axes)
         x = fibonacci(1_500) * axes
         place, triangle, bary = ClosestPoint(mesh.vertices, mesh.triangles)(x)
-        fitted, normals, used = fit_surface(
-            place,
-            mesh.normals_at(triangle, bary),
-            vertices=mesh.vertices,
-            vertex_normals=mesh.vertex_normals,
-            degree=4,
-        )
+        fitted, normals, used = fit_surface(place, mesh.normals_at(triangle, bary), mesh, 4)
         exact = fitted / np.array(axes) ** 2
         exact /= np.linalg.norm(exact, axis=1, keepdims=True)
         flat.append(ellipsoid_distance(place, axes).max())

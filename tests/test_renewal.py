@@ -69,7 +69,7 @@ def test_at_the_same_weights_the_numbers_are_those_of_the_host(kind):
             assert_same(here.extra[2], there.extra[2])
     a, b = host.levels[1], renewed.levels[1]
     assert_same(a.matrix.weights, b.matrix.weights)
-    assert_same(a.turned.weights, b.turned.weights)
+    assert_same(a.transposed.weights, b.transposed.weights)
     assert_same(host.coarsest, renewed.coarsest)
     # The finest matrix is the operator itself.
     r = F if conditions is None else conditions.restrict(F)
@@ -186,7 +186,7 @@ def test_hierarchies_for_all_steps(closed):
         for name in ("mass_diagonal", "stiff_diagonal", "radius"):
             assert_same(getattr(a, name), getattr(b, name))
         assert_same(a.prolong.weights, b.prolong.weights)
-    for name in ("mass", "stiff", "mass_turned", "stiff_turned"):
+    for name in ("mass", "stiff", "mass_transposed", "stiff_transposed"):
         a, b = (getattr(hierarchy.pairs[1], name) for hierarchy in (host, renewed))
         assert_same(a.weights, b.weights)
     assert_same(host.mass, renewed.mass)

@@ -21,12 +21,12 @@ def detect_border(cloud: PointCloud, *, k: int = _RING, gap: float = _GAP) -> Bo
     """Points of a cloud that look like border points, for `PointCloud.boundary`.
 
     Seen from an inner point the neighbours lie all around; at a border they leave an angle
-    free, about a half turn.
+    empty, about a half turn.
 
     Args:
         cloud: n points with unit normals, concrete.
         k: number of neighbours looked at, the point included.
-        gap: free angle in the tangent plane that makes a border point, in radians, below π.
+        gap: empty angle in the tangent plane that makes a border point, in radians, below π.
 
     Returns:
         Mask `(n,)`. On very uneven points it may name inner points and leave border points

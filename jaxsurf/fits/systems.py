@@ -107,13 +107,13 @@ def _by_columns(a, shift):
 
     def substitute(b):
         def forward(i, y):
-            rest = b[i] - jnp.sum(columns[:, i, None] * y, axis=0)
-            return y.at[i].set(rest / pivot[i])
+            left = b[i] - jnp.sum(columns[:, i, None] * y, axis=0)
+            return y.at[i].set(left / pivot[i])
 
         def backward(j, x):
             i = m - 1 - j
-            rest = y[i] - jnp.sum(columns[i, :, None] * x, axis=0)
-            return x.at[i].set(rest / pivot[i])
+            left = y[i] - jnp.sum(columns[i, :, None] * x, axis=0)
+            return x.at[i].set(left / pivot[i])
 
         y = jax.lax.fori_loop(0, m, forward, jnp.zeros_like(b))
         return jax.lax.fori_loop(0, m, backward, jnp.zeros_like(b))

@@ -25,17 +25,17 @@ def obj(path: Path) -> Contents:
     corner_normals: list[tuple[int, int]] = []
     bare_corners = 0
     for number, line in _lines(path):
-        word, *rest = line.split()
+        word, *words = line.split()
         try:
             if word == "v":
-                points.append(_numbers(rest, 3))
+                points.append(_numbers(words, 3))
             elif word == "vn":
-                directions.append(_numbers(rest, 3))
+                directions.append(_numbers(words, 3))
             elif word == "f":
-                if len(rest) < 3:
-                    raise ValueError(f"a face with {len(rest)} corners, at least 3 are needed")
+                if len(words) < 3:
+                    raise ValueError(f"a face with {len(words)} corners, at least 3 are needed")
                 face = []
-                for corner in rest:
+                for corner in words:
                     index, *others = corner.split("/")
                     # Negative numbers count back from the last vertex so far.
                     i = int(index)

@@ -12,7 +12,6 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
-from numpy import ndarray as Array
 
 from jaxsurf.formats.contents import Contents, complete
 
@@ -117,10 +116,6 @@ def _unmarked(path: Path, data: bytes):
         yield copy
 
 
-def _native(value: Array) -> Array:
-    return value.astype(value.dtype.newbyteorder("="))
-
-
 def _contents(mesh) -> Contents:
     points = np.asarray(mesh.points, float)
     if points.ndim == 2 and points.shape[1] == 2:
@@ -134,7 +129,8 @@ def _contents(mesh) -> Contents:
         elif cells.type != "vertex":
             raise ValueError(f"cells of type {cells.type!r} do not make a surface of polygons")
     # VTK files are big-endian.
-    data = {k: _native(np.asarray(v)) for k, v in mesh.point_data.items()}
+    native = lambda v: v.astype(v.dtype.newbyteorder("="))
+    data = {k: native(np.asarray(v)) for k, v in mesh.point_data.items()}
     normals = None
     for name in ("normals", "Normals"):
         if normals is None and name in data and data[name].shape == points.shape:

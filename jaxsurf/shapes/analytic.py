@@ -234,8 +234,8 @@ def _equal_area_ellipsoid(n: int, semi: np.ndarray) -> tuple[np.ndarray, float]:
     phi = (1 - u) * ((1 - v) * inverse[row, column] + v * inverse[row, column + 1]) + u * (
         (1 - v) * inverse[row + 1, column] + v * inverse[row + 1, column + 1]
     )
-    turned = swept(np.stack([np.sqrt(1 - height**2), height], axis=1), phi)
-    return turned[:, np.argsort(turn)], area
+    points = swept(np.stack([np.sqrt(1 - height**2), height], axis=1), phi)
+    return points[:, np.argsort(turn)], area
 
 
 def _check_positive(name: str, value: Any) -> None:

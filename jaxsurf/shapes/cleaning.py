@@ -147,13 +147,13 @@ def _faces_to_flip(triangles: Int[Array, "m 3"], n: int) -> Bool[Array, " m"]:
         ]
     )
     sheets = csgraph.connected_components(graph_of(links, 2 * m), directed=False)[1]
-    as_given, turned = sheets[:m], sheets[m:]
-    bad = np.flatnonzero(as_given == turned)
+    as_given, flipped = sheets[:m], sheets[m:]
+    bad = np.flatnonzero(as_given == flipped)
     if bad.size:
         raise ValueError(
             "the surface has only one side (a Möbius band or worse): no orientation of the"
             f" {bad.size} triangles joined to triangle {bad[0]} is consistent"
         )
     votes = np.bincount(as_given, minlength=sheets.max() + 1)
-    tie = (votes[as_given] == votes[turned]) & (as_given > turned)
-    return (votes[as_given] < votes[turned]) | tie
+    tie = (votes[as_given] == votes[flipped]) & (as_given > flipped)
+    return (votes[as_given] < votes[flipped]) | tie

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from jaxsurf.fits.monomials import polynomial_count
 from jaxsurf.fits.plane import TangentPlane, dot
+from jaxsurf.shapes.meshes import TriangleMesh
 
 # Cosine of the largest angle between a fitted normal and that of the mesh: 35 degrees.
 _MOST_TURN = 0.82
@@ -118,12 +119,7 @@ def _dot(a, b):
 
 
 def fit_surface(
-    points: Float[Array, "q 3"],
-    normals: Float[Array, "q 3"],
-    *,
-    vertices: Float[Array, "n 3"],
-    vertex_normals: Float[Array, "n 3"],
-    degree: int,
+    points: Float[Array, "q 3"], normals: Float[Array, "q 3"], mesh: TriangleMesh, degree: int
 ) -> tuple[Float[Array, "q 3"], Float[Array, "q 3"], Int[Array, " q"]]:
     """Move points along their normals onto local polynomial fits of the vertices.
 
@@ -136,22 +132,21 @@ def fit_surface(
     Args:
         points: places near the surface, `(q, 3)`.
         normals: unit normals there, `(q, 3)`.
-        vertices: points of the surface, `(n, 3)`.
-        vertex_normals: their unit normals, `(n, 3)`.
+        mesh: its vertices are points of the surface.
         degree: degree of the polynomials.
 
     Returns:
         New points, new normals, and the degree used at each point (0: left where it was).
     """
     points, normals = points.copy(), normals.copy()
-    tree = cKDTree(vertices)
+    tree = cKDTree(mesh.vertices)
     used = np.zeros(len(points), np.int64)
     for block in np.array_split(np.arange(len(points)), max(1, len(points) // 2048)):
         todo, p = block, degree
         while todo.size and p > 0:
             x, m, good = points[todo], normals[todo], np.ones(len(todo), bool)
             for _ in range(2):
-                x, m, solved = _fit_once(x, m, tree, vertices, vertex_normals, p)
+                x, m, solved = _fit_once(x, m, tree, mesh, p)
                 good &= solved
             # Extrapolated over noisy borders, high degrees turn the normal at will; no mesh
             # that resolves its surface has normals this far from those of its triangles.
@@ -161,13 +156,13 @@ def fit_surface(
     return points, normals, used
 
 
-def _fit_once(points, normals, tree, vertices, vertex_normals, degree):
+def _fit_once(points, normals, tree, mesh, degree):
     size = polynomial_count(2, degree)
     k = min(2 * size + 4, tree.n)
     far, index = tree.query(points, k=range(1, k + 1))
     slots, radius, normals = index.T, far[:, -1], normals.T
-    offsets = np.stack([v[slots] - x for v, x in zip(vertices.T, points.T)], axis=1)
-    same = sum(v[slots] * n for v, n in zip(vertex_normals.T, normals)) > 0.25
+    offsets = np.stack([v[slots] - x for v, x in zip(mesh.vertices.T, points.T)], axis=1)
+    same = sum(v[slots] * n for v, n in zip(mesh.vertex_normals.T, normals)) > 0.25
     weights = np.where(same, np.exp(-5 * dot(offsets, offsets) / radius**2), 0)
     plane = TangentPlane.at(normals, offsets, weights, radius, radius)
     c, condition = plane.surface(0, degree)

@@ -133,10 +133,7 @@ def graph(
         >>> bump.n, int(bump.boundary.sum()), bool((bump.normals[:, 2] > 0).all())
         (600, 96, True)
     """
-    box = in_range(on_host(bounds, "bounds"), "bounds")
-    if box.shape != (2, 2):
-        raise ValueError(f"bounds must be two corners in the plane, shape (2, 2), not {box.shape}")
-    (x0, y0), (x1, y1) = box
+    (x0, y0), (x1, y1) = in_range(on_host(bounds, "bounds", (2, 2)), "bounds")
     if not (x1 > x0 and y1 > y0):
         raise ValueError(f"upper corner {bounds[1]} must exceed lower corner {bounds[0]}")
     dtype = jnp.result_type(float)

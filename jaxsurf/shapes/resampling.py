@@ -91,13 +91,7 @@ def sample_mesh(
     )
     points, normals = project(points, exact=True)
     if smooth:
-        points, normals, used = fit_surface(
-            points,
-            normals,
-            vertices=mesh.vertices,
-            vertex_normals=mesh.vertex_normals,
-            degree=degree,
-        )
+        points, normals, used = fit_surface(points, normals, mesh, degree)
         low = np.flatnonzero(used < degree)
         if low.size:
             warnings.warn(

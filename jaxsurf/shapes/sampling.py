@@ -20,7 +20,7 @@ from jaxsurf.arguments import instance, on_host, real, whole
 from jaxsurf.cloud import PointCloud
 from jaxsurf.failures import not_finite, raise_at
 from jaxsurf.shapes.spacing import ideal_spacing, same_sheet
-from jaxsurf.shapes.thinning import DISK, checked_like, checked_points, thin
+from jaxsurf.shapes.thinning import DISK, checked_points, thin
 
 Project = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -231,8 +231,8 @@ def _projected(points: np.ndarray, project: Project) -> tuple[np.ndarray, np.nda
     result = project(points)
     if not (isinstance(result, tuple) and len(result) == 2):
         raise TypeError("project must return a pair: points and unit normals")
-    onto = checked_like(result[0], points, "the points that project returns")
-    normals = checked_like(result[1], points, "the normals that project returns")
+    onto = on_host(result[0], "the points that project returns", points.shape)
+    normals = on_host(result[1], "the normals that project returns", points.shape)
     bad = not_finite(onto) | not_finite(normals)
     raise_at(bad, "projection failed for point {i} at {v}", points)
     return onto, normals

@@ -50,7 +50,7 @@ def poisson_disk(
     real(radius, "radius", above=0)
     whole(seed, "seed", least=0)
     if normals is not None:
-        normals = checked_like(normals, candidates, "normals")
+        normals = on_host(normals, "normals", candidates.shape)
     rank = np.random.default_rng(seed).permutation(len(candidates))
     pairs = cKDTree(candidates).query_pairs(radius, output_type="ndarray")
     if normals is not None:
@@ -118,10 +118,6 @@ def checked_points(values, name: str) -> np.ndarray:
     points = on_host(values, name, *POINTS)
     raise_at(not_finite(points), f"{name}: point {{i}} is not finite: {{v}}", points)
     return in_range(points, name)
-
-
-def checked_like(values, points: np.ndarray, name: str) -> np.ndarray:
-    return on_host(values, name, points.shape)
 
 
 def _candidate_spacing(candidates: np.ndarray) -> float:

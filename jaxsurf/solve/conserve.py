@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import lineax as lx
 from jaxtyping import Array, ArrayLike, Float
 
 from ..arguments import instance, real
 from ..compiling import sized_jit
 from ..failures import refuse
-from ..stencils.lineax import Action
 from ..stencils.stencil import Stencil, prepared
-from .krylov import BiCGStab
+from .krylov import BiCGStab, solve_system
 from .precondition import AbstractPreconditioner, multigrid
 from .system import System, check_system
 
@@ -89,20 +87,15 @@ def _weights(operator, total, preconditioner):
     # S = L - σ p pᵀ / n, p = 1, is not singular, and Sᵀ m = -σ total / n where Lᵀ m = 0.
     dtype = total.dtype
     system = System.of(operator, None, dtype, True)
-    adjoint = Action(system.matrix.T, dtype)
+    adjoint = system.matrix.T
     fixed, inverse = jax.lax.stop_gradient((adjoint, system.inverse(preconditioner).T))
-    options = {"preconditioner": Action(inverse, dtype)}
     solver = BiCGStab(_SOLVED * float(jnp.finfo(dtype).eps))
     sigma = jnp.asarray(system.sigma)
     rhs = system.constant(-sigma * total / system.count, dtype)
-
-    def solved(matrix, b):
-        return lx.linear_solve(matrix, b, solver, options=options, throw=False).value
-
-    first = solved(fixed, jax.lax.stop_gradient(rhs))
+    first = solve_system(fixed, jax.lax.stop_gradient(rhs), solver, inverse).value
     # Has the derivative of the solution.
-    weights = first + solved(adjoint, rhs - adjoint.mv(first))
-    products = jax.lax.stop_gradient(adjoint.mv(weights) - rhs)
+    weights = first + solve_system(adjoint, rhs - adjoint(first), solver, inverse).value
+    products = jax.lax.stop_gradient(adjoint(weights) - rhs)
     size = jax.lax.stop_gradient(jnp.max(jnp.abs(operator.diagonal * weights)))
     left = jnp.abs(products) / size
     return weights, left, ~(left <= _LEFT * jnp.finfo(dtype).eps)

@@ -114,10 +114,10 @@ def eigenmodes(
     if not 1 <= k <= n // 2:
         raise ValueError(f"k = {k} modes, between 1 and n / 2 = {n // 2} can be computed")
     system = _System.of(operator, conditions)
-    values, functions, *rest = _modes(system, k, degenerate)
+    values, functions, *others = _modes(system, k, degenerate)
     if conditions is not None:
         functions = conditions.homogeneous(functions)
-    return Eigenmodes(values, functions, *rest)
+    return Eigenmodes(values, functions, *others)
 
 
 class _System(eqx.Module):
@@ -160,12 +160,12 @@ def _modes(system: _System, k: int, degenerate: float):
 def _modes_jvp(primals, tangents):
     system, k, degenerate = primals
     space = _subspace(system, k, degenerate, left=True)
-    values, functions, *rest = _results(system, space, k)
+    values, functions, *others = _results(system, space, k)
     if not jax.tree.leaves(tangents[0]):
-        return (values, functions, *rest), (None,) * 5
+        return (values, functions, *others), (None,) * 5
 
     values_dot, functions_dot = _tangents(system, tangents[0], space, k)
-    return (values, functions, *rest), (values_dot, functions_dot, None, None, None)
+    return (values, functions, *others), (values_dot, functions_dot, None, None, None)
 
 
 def _tangents(system: _System, system_dot: _System, space: Subspace, k: int):
@@ -263,7 +263,8 @@ def _sylvester(system: _System, space: Subspace, rhs: Float[Array, "n K"]) -> Fl
         def compute(system, space, b):
             matrix, free = system.to_scipy()
             matrix = matrix.T.tocsr() if transposed else matrix
-            return _spread(invariant.sylvester(matrix, _at(space, free), b[free]), free, *like)
+            space = space._replace(right=space.right[free], left=space.left[free])
+            return _spread(invariant.sylvester(matrix, space, b[free]), free, *like)
 
         like = b.shape[0], b.dtype
         return _on_host(compute, jax.ShapeDtypeStruct(b.shape, b.dtype), system, space, b)
@@ -288,11 +289,11 @@ def _sylvester(system: _System, space: Subspace, rhs: Float[Array, "n K"]) -> Fl
 
 def _on_host(function, shapes, *arguments):
     """Call a function of NumPy arrays: at once if their values are known, else when they are."""
-    arrays, rest = eqx.partition(arguments, eqx.is_array)
+    arrays, static = eqx.partition(arguments, eqx.is_array)
 
     def call(arrays):
         arrays = jax.tree.map(np.asarray, arrays)
-        return function(*eqx.combine(arrays, rest))
+        return function(*eqx.combine(arrays, static))
 
     if is_concrete(arrays):
         found = call(arrays)
@@ -317,7 +318,3 @@ def _spread(tree, free, n: int, dtype):
         tree = tree._replace(right=place(tree.right), left=place(tree.left))
         return jax.tree.map(one, tree)
     return one(place(tree))
-
-
-def _at(space: Subspace, free) -> Subspace:
-    return space._replace(right=space.right[free], left=space.left[free])

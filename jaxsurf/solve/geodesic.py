@@ -6,7 +6,6 @@ import functools
 import math
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -21,10 +20,9 @@ from ..discretization import Discretization
 from ..failures import is_concrete, needs_values, refuse
 from ..neighbors import Neighbors, find_neighbors, switched_on
 from ..stencils.gfdm import GFDM
-from ..stencils.lineax import Action
 from ..stencils.method import AbstractMethod
 from ..stencils.stencil import Stencil
-from .krylov import BiCGStab
+from .krylov import BiCGStab, solve_system
 from .paths import around, path_lengths, source_indices
 from .precondition import multigrid
 
@@ -172,32 +170,32 @@ def _warm(heat: Stencil, start, rtol: float):
     values = _relaxed(known, given, known.diagonal, jnp.abs, rtol)
     weights = heat.weights * (values[heat.indices] / values)
     # Zero; what is left of it is the derivative of the equation at its solution.
-    rest = start / values - Stencil(heat.indices, weights)(jnp.ones_like(values))
-    rest = rest - jax.lax.stop_gradient(rest)
-    return values * (1 + _zero(weights, rest, heat.indices, rtol))
+    residual = start / values - Stencil(heat.indices, weights)(jnp.ones_like(values))
+    residual = residual - jax.lax.stop_gradient(residual)
+    return values * (1 + _zero(weights, residual, heat.indices, rtol))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
-def _zero(weights, rest, indices, rtol: float):
+def _zero(weights, residual, indices, rtol: float):
     """The solution of a system whose right-hand side is zero: only its derivative is solved for."""
     del weights, indices, rtol
-    return jnp.zeros_like(rest)
+    return jnp.zeros_like(residual)
 
 
 @_zero.defjvp
 def _zero_jvp(rtol, primals, tangents):
-    weights, rest, indices = primals
-    d_weights, d_rest, _ = tangents
+    weights, residual, indices = primals
+    d_weights, d_residual, _ = tangents
     operator = Stencil(indices, weights)
     diagonal = jax.lax.stop_gradient(operator.diagonal)
-    nothing = _zero(weights, rest, indices, rtol)
+    nothing = _zero(weights, residual, indices, rtol)
 
     def solve(matvec, b):
         largest = lambda x: jnp.max(jnp.abs(x))
         return _relaxed(matvec, b, diagonal, largest, rtol)
 
-    d_rest = d_rest - Stencil(indices, d_weights)(nothing)
-    return nothing, jax.lax.custom_linear_solve(operator, d_rest, solve, solve)
+    d_residual = d_residual - Stencil(indices, d_weights)(nothing)
+    return nothing, jax.lax.custom_linear_solve(operator, d_residual, solve, solve)
 
 
 def _relaxed(operator: Callable, rhs, diagonal, size: Callable, rtol: float):
@@ -238,10 +236,10 @@ def _shares(mask) -> Float[np.ndarray, "k n"]:
     return share / np.where(total > 0, total, 1)
 
 
-def _differences(indices, share, fixed) -> Stencil:
+def _differences(indices, share, fixed, table=None) -> Stencil:
     """Value less the mean of the others, between free points; the identity where it is known."""
     own = np.arange(len(share))[:, None] == 0
-    return Stencil(indices, own - share * ~(fixed | fixed[indices]))
+    return Stencil(indices, own - share * ~(fixed | fixed[indices]), table=table)
 
 
 def _preconditioner(indices, share, fixed, differentiated: bool):
@@ -261,13 +259,8 @@ def _integrate(x, normals, indices, share, direction, fixed, value, inverse, rto
 
     rhs, _ = jax.lax.scan(add_slot, jnp.zeros_like(value), (indices, share))
     preconditioner, table = inverse
-    operator = eqx.tree_at(
-        lambda s: s.table, _differences(indices, share, fixed), table, is_leaf=lambda x: x is None
-    )
-    options = {"preconditioner": Action(preconditioner, rhs.dtype)}
-    matrix = Action(operator, rhs.dtype)
-    rhs = jnp.where(fixed, 0, rhs)
-    found = lx.linear_solve(matrix, rhs, BiCGStab(rtol), options=options, throw=False)
+    operator = _differences(indices, share, fixed, table)
+    found = solve_system(operator, jnp.where(fixed, 0, rhs), BiCGStab(rtol), preconditioner)
     free = refuse(
         found.value,
         found.result != lx.RESULTS.successful,

@@ -147,7 +147,7 @@ def sylvester(
     known = w.T @ rhs
     # Columns without a right-hand side have no solution to be looked for.
     needed = np.any(rhs != 0, axis=0)
-    rest = (rhs - v @ known) @ mix
+    outside = (rhs - v @ known) @ mix
     known = unmix @ known @ mix
     between = mu[:, None] - mu + np.where(same, space.scale, 0)
     complete = np.any(v != 0, axis=0)
@@ -156,7 +156,7 @@ def sylvester(
 
     inverse = Inverse(matrix, shift=-_scale(matrix))
     for j in np.flatnonzero(np.any(same[:, needed], axis=1)):
-        column = rest[:, j]
+        column = outside[:, j]
         if not np.any(column):
             continue
         real = abs(mu[j].imag) == 0 and not np.any(column.imag)

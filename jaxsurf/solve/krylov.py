@@ -14,6 +14,8 @@ from jaxtyping import Array, Float
 
 from ..arguments import real, whole
 from ..failures import is_concrete
+from ..stencils.algebra import AbstractOperator
+from ..stencils.lineax import Action
 
 _Results = lx.RESULTS
 
@@ -104,16 +106,24 @@ class BiCGStab(lx.AbstractLinearSolver):
         return unravel(scale * x), result, {"num_steps": steps, "max_steps": self.max_steps}
 
     def transpose(self, state, options):
-        turned = {}
+        transposed = {}
         if "preconditioner" in options:
-            turned["preconditioner"] = options["preconditioner"].transpose()
-        return state.transpose(), turned
+            transposed["preconditioner"] = options["preconditioner"].transpose()
+        return state.transpose(), transposed
 
     def conj(self, state, options):
         return lx.conj(state), options
 
     def assume_full_rank(self):
         return True
+
+
+def solve_system(
+    matrix: AbstractOperator, b: Float[Array, " n"], solver, inverse: AbstractOperator
+) -> lx.Solution:
+    """Solve by a solver of lineax, with an approximate inverse; does not raise."""
+    options = {"preconditioner": Action(inverse, b.dtype)}
+    return lx.linear_solve(Action(matrix, b.dtype), b, solver, options=options, throw=False)
 
 
 def scale_of(x: Float[Array, " n"]) -> Float[Array, ""]:
@@ -173,14 +183,11 @@ class _Run(eqx.Module):
         x, r, v, alpha, omega = jax.lax.fori_loop(0, 2, half, start)
         size = jnp.linalg.norm(r)
         # The shadow residual has to see the residual, and omega must not vanish.
-        seen = jnp.abs(rho) > _eps(r) * jnp.linalg.norm(self.shadow) * self.size
+        eps = jnp.finfo(r.dtype).eps
+        seen = jnp.abs(rho) > eps * jnp.linalg.norm(self.shadow) * self.size
         sound = jnp.isfinite(size) & seen
         keep = lambda new, old: jnp.where(sound, new, old)
         return _Run(
             keep(x, self.x), keep(r, self.r), self.shadow, p, v, rho, alpha, omega,
             keep(size, self.size), self.steps + 1, sound & (omega != 0),
         )  # fmt: skip
-
-
-def _eps(x):
-    return jnp.finfo(x.dtype).eps

@@ -17,11 +17,10 @@ from ..arguments import as_float, finite, switched_off, whole
 from ..boundary import Closure
 from ..compiling import sized_jit
 from ..failures import is_concrete, refuse
-from ..functions import canonical, numbers_as_arrays
+from ..functions import canonical, constant, numbers_as_arrays
 from ..stencils.algebra import AbstractOperator, Map
-from ..stencils.lineax import Action
 from ..stencils.stencil import prepared
-from .krylov import BiCGStab, tolerances_as_arrays
+from .krylov import BiCGStab, solve_system, tolerances_as_arrays
 from .precondition import AbstractPreconditioner, multigrid
 from .system import System, check_system, tolerance
 
@@ -166,12 +165,10 @@ class _Problem(eqx.Module):
 
     def correction(self, v, residual, preconditioner, solver):
         """The solution of (L + r') delta = residual; what it is linearised at is a constant."""
-        fixed, v = _constant((self, v))
+        fixed, v = constant((self, v))
         slope = _Slope(fixed.reaction, fixed.args, fixed.field(v))
         system = System(fixed.operator + Map(slope, len(v)), fixed.conditions)
-        options = {"preconditioner": Action(_constant(preconditioner), v.dtype)}
-        matrix = Action(system.matrix, v.dtype)
-        return lx.linear_solve(matrix, residual, solver, options=options, throw=False)
+        return solve_system(system.matrix, residual, solver, constant(preconditioner))
 
 
 class _State(eqx.Module):
@@ -185,7 +182,7 @@ class _State(eqx.Module):
 
 @sized_jit
 def _solve(problem, u0, preconditioner, solver, rtol, atol, max_steps, concrete, throw):
-    fixed = _constant(problem)
+    fixed = constant(problem)
     loose = BiCGStab(_FORCING, 0.0, 1000) if solver is None else solver
     start = fixed.residual(jax.lax.stop_gradient(u0))
     size = jnp.linalg.norm(start)
@@ -249,11 +246,6 @@ def _solve(problem, u0, preconditioner, solver, rtol, atol, max_steps, concrete,
         "relative_residual": state.size / jnp.where(scale > 0, scale, 1),
     }
     return optx.Solution(u, result, None, stats, None)
-
-
-def _constant(tree):
-    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(jax.lax.stop_gradient(arrays), rest)
 
 
 class _Slope(eqx.Module):

@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from ..arguments import switched_off
 from ..cloud import PointCloud
+from ..compiling import power_of_two
 from ..failures import is_concrete, needs_values, raise_at
 
 
@@ -87,12 +88,7 @@ def around(indices, sources):
     row, owner = row[order], pairs[order, 1]
     first = np.searchsorted(row, np.arange(len(near)))
     place = np.arange(len(row)) - first[row]
-    owners = np.tile(owner[first][:, None], _room(int(place.max()) + 1))
+    owners = np.tile(owner[first][:, None], power_of_two(int(place.max()) + 1))
     owners[row, place] = owner
-    full = np.minimum(np.arange(min(_room(len(near)), len(indices))), len(near) - 1)
+    full = np.minimum(np.arange(min(power_of_two(len(near)), len(indices))), len(near) - 1)
     return near[full].astype(np.int32), owners[full].astype(np.int32)
-
-
-def _room(count: int) -> int:
-    """The next power of two."""
-    return 1 << (count - 1).bit_length()

@@ -23,8 +23,8 @@ from .reduced import (
     annihilates_constants,
     check_kinds,
     free_operator,
-    free_points,
     reduced_matrix,
+    restriction_of,
     stand_in,
 )
 
@@ -70,9 +70,7 @@ class Jacobi(AbstractPreconditioner):
 
     divisor: Float[Array, " n"]
 
-    @property
-    def n(self):
-        return len(self.divisor)
+    n = property(lambda self: len(self.divisor))
 
     def __call__(self, r):
         return r / self.divisor
@@ -86,7 +84,7 @@ class Level(eqx.Module):
 
     Args:
         matrix: the operator on this level.
-        turned: its transpose; None where that is at hand.
+        transposed: its transpose; None where that is at hand.
         inverse: of the diagonal.
         restrict: to the next coarser level.
         prolong: from there.
@@ -94,15 +92,13 @@ class Level(eqx.Module):
     """
 
     matrix: PaddedMatrix | AbstractOperator
-    turned: PaddedMatrix | AbstractOperator | None
+    transposed: PaddedMatrix | AbstractOperator | None
     inverse: Float[Array, " n"]
     restrict: PaddedMatrix
     prolong: PaddedMatrix
     damping: tuple[Float[Array, ""], ...]
 
-    @property
-    def n(self) -> int:
-        return self.inverse.shape[0]
+    n = property(lambda self: self.inverse.shape[0])
 
     def smooth(self, x, b):
         """The smoother from x. Its steps are a loop: the matrix is compiled once."""
@@ -123,8 +119,8 @@ class Level(eqx.Module):
     def T(self) -> Level:
         # The prolongation is the transposed restriction: both stay. So do polynomials in
         # D⁻¹A times D⁻¹, with A transposed.
-        turned = self.matrix.T if self.turned is None else self.turned  # type: ignore[union-attr]
-        return Level(turned, self.matrix, self.inverse, self.restrict, self.prolong, self.damping)
+        matrix = self.matrix.T if self.transposed is None else self.transposed  # type: ignore[union-attr]
+        return Level(matrix, self.matrix, self.inverse, self.restrict, self.prolong, self.damping)
 
 
 class Multigrid(AbstractPreconditioner):
@@ -145,9 +141,7 @@ class Multigrid(AbstractPreconditioner):
     coarsest: Float[Array, "m m"]
     plan: tuple[renewal.Coarsening, ...] | None = None
 
-    @property
-    def n(self):
-        return self.sizes[0]
+    n = property(lambda self: self.sizes[0])
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -218,25 +212,19 @@ class _Product(AbstractPreconditioner):
     outer: Any
     inner: Any
 
-    @classmethod
-    def of(cls, outer, inner):
-        mean_zero = bool(outer.mean_zero or inner.mean_zero)
-        return cls(mean_zero, outer, inner)
-
-    @property
-    def n(self):
-        return self.outer.n
+    n = property(lambda self: self.outer.n)
 
     def __call__(self, r):
         return self.inner(self.outer(r))
 
     def transpose(self):
-        return _Product.of(self.inner.transpose(), self.outer.transpose())
+        return _Product(self.mean_zero, self.inner.T, self.outer.T)
 
     def renewed(self, operator, *, conditions=None):
         instance(operator, Composition, "operator", "as the hierarchy was made for")
         pairs = (self.outer, operator.outer), (self.inner, operator.inner)
-        return _Product.of(*(p.renewed(o, conditions=conditions) for p, o in pairs))
+        both = (p.renewed(o, conditions=conditions) for p, o in pairs)
+        return _Product(self.mean_zero, *both)
 
 
 def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> Jacobi:
@@ -312,8 +300,9 @@ def multigrid(
     """
     check_kinds(operator, conditions)
     if isinstance(operator, Composition) and conditions is None:
-        of = lambda o: multigrid(o, single=single, renewable=renewable, mean_zero=mean_zero)
-        return _Product.of(of(operator.outer), of(operator.inner))
+        make = lambda o: multigrid(o, single=single, renewable=renewable, mean_zero=mean_zero)
+        outer, inner = make(operator.outer), make(operator.inner)
+        return _Product(bool(outer.mean_zero or inner.mean_zero), outer, inner)
     known = without_derivatives((operator, conditions))
     if is_concrete(known):
         return _hierarchy(operator, conditions, single, renewable)
@@ -327,7 +316,7 @@ def multigrid(
 
 def _hierarchy(operator, conditions, single, renewable, mean_zero=None) -> Multigrid:
     fine = reduced_matrix(operator, conditions)
-    free = free_points(operator, conditions)
+    free = restriction_of(operator, conditions).on_host
     mean_zero = annihilates_constants(fine, free) if mean_zero is None else mean_zero
     dtype = np.dtype(np.float32) if single else fine.dtype
     width = USED * operator.k if isinstance(operator, Stencil) else None
@@ -352,7 +341,7 @@ def _hierarchy(operator, conditions, single, renewable, mean_zero=None) -> Multi
     constant = np.append(constant, np.zeros(room - size))
     used = np.arange(room) < size
     coarsest = aggregation.dense_inverse(dense, used, constant if mean_zero else None).astype(dtype)
-    plan = renewal.plan_of(made, [(v.matrix, v.turned) for v in levels]) if renewable else None
+    plan = renewal.plan_of(made, [(v.matrix, v.transposed) for v in levels]) if renewable else None
     return Multigrid(mean_zero, tuple(levels), jnp.asarray(coarsest), plan)
 
 
@@ -382,7 +371,7 @@ def _level(matrix, tentative, dtype, room: int, coarse: int, width, on):
 def _renewed(plan, operator, conditions, mean_zero: bool, dtype) -> Multigrid:
     matrix, restriction = free_operator(operator, conditions)
     below, free = renewal.free_divisor(operator, matrix, restriction)
-    if conditions is not None or operator.active is not None:
+    if not restriction.all_free:
         matrix, below = matrix + (1 - restriction), below + (1 - free)
     found, (dense,), constant = renewal.renewed_levels(
         plan, (matrix,), below, free, operator.active
@@ -390,7 +379,7 @@ def _renewed(plan, operator, conditions, mean_zero: bool, dtype) -> Multigrid:
     levels = tuple(
         Level(
             v.matrices[0],
-            v.turned[0],
+            v.transposed[0],
             renewal.inverted(v.divisor),
             v.restrict,
             v.prolong,

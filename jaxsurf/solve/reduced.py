@@ -30,13 +30,17 @@ def check_kinds(operator, conditions) -> None:
         as_many("conditions", conditions.n, "the operator", operator.n)
 
 
+def restriction_of(operator, conditions) -> Restriction:
+    """P: to the points that are switched on and not bound."""
+    return Restriction(operator.n, conditions, operator.active)
+
+
 def free_operator(operator, conditions) -> tuple[AbstractOperator, Restriction]:
     """P A E and P as operators."""
-    restriction = Restriction(operator.n, conditions, operator.active)
+    restriction = restriction_of(operator, conditions)
     if conditions is not None:
         operator = operator @ conditions.extension
-    all_free = conditions is None and restriction.on is None
-    return operator if all_free else restriction @ operator, restriction
+    return operator if restriction.all_free else restriction @ operator, restriction
 
 
 def stand_in(operator, conditions) -> tuple[AbstractOperator, Closure | None]:
@@ -132,14 +136,6 @@ def reduced_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
             "determines the value there"
         )
     return matrix
-
-
-def free_points(operator, conditions) -> np.ndarray:
-    """Which points are switched on and not bound, on the host."""
-    free = np.ones(operator.n, bool) if operator.active is None else np.array(operator.active)
-    if conditions is not None:
-        free[np.asarray(conditions.rows)] = False
-    return free
 
 
 def annihilates_constants(matrix, free: np.ndarray) -> bool:

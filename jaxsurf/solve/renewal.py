@@ -32,29 +32,29 @@ class Pattern(eqx.Module):
     """Where a matrix has entries, and colours of its columns.
 
     Args:
-        entries, turned: True where it and its transpose have one; None for a dense matrix.
+        entries, transposed: True where it and its transpose have one; None for a dense matrix.
         color: of every column.
         count: of the colours.
     """
 
     entries: PaddedMatrix | None
-    turned: PaddedMatrix | None
+    transposed: PaddedMatrix | None
     color: Int[Array, " p"]
     count: int = eqx.field(static=True)
 
     @classmethod
-    def of(cls, matrix, entries: PaddedMatrix, turned: PaddedMatrix) -> Pattern:
+    def of(cls, matrix, entries: PaddedMatrix, transposed: PaddedMatrix) -> Pattern:
         """Of a CSR matrix, in the layouts of padded ones; on the host."""
         from pyamg.graph import vertex_coloring
 
         ones = matrix.astype(np.float32)
         ones.data[:] = 1
         color = vertex_coloring((ones.T @ ones).tocsr())
-        padded = np.append(color, np.zeros(len(turned.indices[0]) - len(color), color.dtype))
+        padded = np.append(color, np.zeros(len(transposed.indices[0]) - len(color), color.dtype))
         mask = lambda a: jax.tree.map(
             lambda x: jnp.asarray(np.asarray(x) != 0) if eqx.is_inexact_array(x) else x, a
         )
-        return cls(mask(entries), mask(turned), jnp.asarray(padded), _rounded(color.max() + 1))
+        return cls(mask(entries), mask(transposed), jnp.asarray(padded), _rounded(color.max() + 1))
 
     @classmethod
     def dense(cls, size: int) -> Pattern:
@@ -76,14 +76,14 @@ class Pattern(eqx.Module):
         colors = jnp.arange(self.count, dtype=self.color.dtype).reshape(-1, _BLOCK)
         sums = jnp.moveaxis(jax.lax.map(products, colors), 0, 1).reshape(-1, self.count)
         size = jnp.where(constant > 0, constant, 1)
-        if self.entries is None or self.turned is None:
+        if self.entries is None or self.transposed is None:
             return sums[:, : len(size)] / size, None
         held = _filled(self.entries, lambda i, j: sums[i, self.color[j]])
         left = jnp.sum(sums, axis=1) - held(jnp.ones_like(size))
         home = self.color.at[home].get(mode="fill", fill_value=self.count)
         sums = sums.at[jnp.arange(len(sums)), home].add(left, mode="drop")
         entry = lambda i, j: sums[i, self.color[j]] / size[j]
-        return _filled(self.entries, entry), _filled(self.turned, lambda j, i: entry(i, j))
+        return _filled(self.entries, entry), _filled(self.transposed, lambda j, i: entry(i, j))
 
 
 def _rounded(count) -> int:
@@ -173,7 +173,7 @@ class Renewed(NamedTuple):
     """A level: its matrices and their transposes, the first one's divisor and radius, transfers."""
 
     matrices: tuple
-    turned: tuple
+    transposed: tuple
     divisor: Float[Array, " n"]
     radius: Float[Array, ""]
     prolong: PaddedMatrix
@@ -192,7 +192,7 @@ def renewed_levels(
         on: True at points that are on; None if all are.
     """
     levels: list[Renewed] = []
-    turned: tuple = (None,) * len(matrices)
+    transposed: tuple = (None,) * len(matrices)
     for step in plan:
         if levels:
             divisor = divisor_of(matrices[0])
@@ -200,9 +200,9 @@ def renewed_levels(
         A, inverse = matrices[0], inverted(divisor)
         radius = radius_of(A, inverse, on)
         prolong, restrict, constant = step.transfers(A, inverse, radius, constant)
-        levels.append(Renewed(matrices, turned, divisor, radius, prolong, restrict))
+        levels.append(Renewed(matrices, transposed, divisor, radius, prolong, restrict))
         below = [step.product(A, prolong, restrict, constant) for A in matrices]
-        matrices, turned = zip(*below)
+        matrices, transposed = zip(*below)
     if not plan:
         matrices = tuple(A(jnp.eye(len(constant), dtype=constant.dtype)) for A in matrices)
     return levels, matrices, constant

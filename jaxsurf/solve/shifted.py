@@ -28,7 +28,7 @@ class _Pair(eqx.Module):
 
     Args:
         mass, stiff: M and A; M is None on the finest level of a renewed hierarchy.
-        mass_turned, stiff_turned: their transposes; None there.
+        mass_transposed, stiff_transposed: their transposes; None there.
         mass_diagonal, stiff_diagonal: what to divide by; safe for rows of both signs.
         restrict, prolong: to and from the next coarser level.
         radius: of either after division by its diagonal, the larger.
@@ -36,8 +36,8 @@ class _Pair(eqx.Module):
 
     mass: PaddedMatrix | None
     stiff: Any
-    mass_turned: PaddedMatrix | None
-    stiff_turned: Any
+    mass_transposed: PaddedMatrix | None
+    stiff_transposed: Any
     mass_diagonal: Float[Array, " m"]
     stiff_diagonal: Float[Array, " m"]
     restrict: PaddedMatrix
@@ -47,19 +47,19 @@ class _Pair(eqx.Module):
     @property
     def patterns(self) -> tuple[PaddedMatrix, PaddedMatrix]:
         """Both matrices added in modulus, and the transpose of that."""
-        both = (self.mass, self.stiff), (self.mass_turned, self.stiff_turned)
+        both = (self.mass, self.stiff), (self.mass_transposed, self.stiff_transposed)
         return tuple(renewal.moduli(mass).minus(-1, renewal.moduli(stiff)) for mass, stiff in both)
 
     def at(self, g) -> Level:
         inverse = 1 / (self.mass_diagonal - g * self.stiff_diagonal)
-        if self.mass is None or self.mass_turned is None:
-            matrix, turned = 1 - g * self.stiff, None
+        if self.mass is None or self.mass_transposed is None:
+            matrix, transposed = 1 - g * self.stiff, None
         else:
             matrix = self.mass.minus(g, self.stiff)
-            turned = self.mass_turned.minus(g, self.stiff_turned)
+            transposed = self.mass_transposed.minus(g, self.stiff_transposed)
         return Level(
             matrix,
-            turned,
+            transposed,
             inverse,
             self.restrict,
             self.prolong,
@@ -159,13 +159,13 @@ def _pair(mass, stiff, tentative, room: int, coarse: int, width, on):
     both = (mass + 1j * stiff).tocsr()
     single = np.dtype(np.float32)
     pad = lambda a: PaddedMatrix.from_scipy(a.tocsr(), single, rows=room, width=width)
-    turned = both.T.tocsr()
+    transposed = both.T.tocsr()
     padded = pad(both.real)
     pair = _Pair(
         padded,
         pad(both.imag),
-        pad(turned.real),
-        pad(turned.imag),
+        pad(transposed.real),
+        pad(transposed.imag),
         aggregation.filled(beside.astype(single), room, 1),
         aggregation.filled(below.astype(single), room),
         *aggregation.transfers(padded, restrict, prolong, coarse),
@@ -183,19 +183,16 @@ def _renewed(plan, operator, conditions) -> ShiftedMultigrid:
     found, (stiff, mass), _ = renewal.renewed_levels(plan, matrices, below, free, operator.active)
     pairs = []
     for depth, v in enumerate(found):
-        (stiff_here, mass_here), (stiff_turned, mass_turned) = v.matrices, v.turned
+        (A, M), (A_T, M_T) = v.matrices, v.transposed
         beside, radius = jnp.ones_like(v.divisor), jnp.ones(())
         if depth == 0:
-            mass_here = None
+            M = None
         else:
-            size = renewal.divisor_of(mass_here)
-            radius = renewal.radius_of(mass_here, renewal.inverted(size), size != 0)
+            size = renewal.divisor_of(M)
+            radius = renewal.radius_of(M, renewal.inverted(size), size != 0)
             beside = jnp.where(size == 0, 1, size)
-        diagonals, transfers = (beside, v.divisor), (v.restrict, v.prolong)
         radius = jnp.maximum(v.radius, radius)
-        pairs.append(
-            _Pair(mass_here, stiff_here, mass_turned, stiff_turned, *diagonals, *transfers, radius)
-        )
+        pairs.append(_Pair(M, A, M_T, A_T, beside, v.divisor, v.restrict, v.prolong, radius))
     # The unknowns that fill it up have the equation x = 0.
     mass = mass + jnp.diag(jnp.where(jnp.diagonal(mass) == 0, 1, 0))
     return renewal.narrowed(ShiftedMultigrid(tuple(pairs), mass, stiff), np.dtype(np.float32))

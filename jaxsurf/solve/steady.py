@@ -13,11 +13,10 @@ from ..boundary import Closure
 from ..compiling import at_once, sized_jit
 from ..failures import is_concrete, needs_values, refuse, without_derivatives
 from ..stencils.algebra import AbstractOperator
-from ..stencils.lineax import Action
 from ..stencils.stencil import prepared
-from .krylov import BiCGStab, scale_of, tolerances_as_arrays
+from .krylov import BiCGStab, scale_of, solve_system, tolerances_as_arrays
 from .precondition import AbstractPreconditioner, multigrid
-from .reduced import annihilates_constants, free_points, reduced_matrix
+from .reduced import annihilates_constants, reduced_matrix, restriction_of
 from .system import System, check_system, tolerance
 
 # An incompatible part may be this share of what of the right-hand side is not resolved,
@@ -141,12 +140,9 @@ def _solve_one(rhs, operator, conditions, preconditioner, solver, limits, mean_z
     rtol, atol, given, project = limits
     system = System.of(operator, conditions, rhs.dtype, mean_zero)
     offset = jnp.zeros_like(rhs) if conditions is None else conditions.offset()
-    known = rhs if conditions is None else system.free(rhs - operator(offset))
+    known = rhs if conditions is None else system.restriction(rhs - operator(offset))
     inverse = jax.lax.stop_gradient(system.inverse(preconditioner))
-    options = {"preconditioner": Action(inverse, rhs.dtype)}
-    matrix = Action(system.matrix, rhs.dtype)
-    found = lx.linear_solve(matrix, known, solver, options=options, throw=False)
-
+    found = solve_system(system.matrix, known, solver, inverse)
     v = found.value
     u = v if conditions is None else conditions.homogeneous(v) + offset
     if mean_zero:
@@ -208,7 +204,7 @@ def _is_mean_zero(operator, conditions, preconditioner) -> bool:
         known,
         instead="pass mean_zero=True or False, or a preconditioner made outside jit and vmap",
     )
-    free = free_points(operator, conditions)
+    free = restriction_of(operator, conditions).on_host
     return annihilates_constants(reduced_matrix(operator, conditions), free)
 
 

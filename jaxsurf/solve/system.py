@@ -13,7 +13,7 @@ from ..boundary import Closure, Restriction, check_border
 from ..stencils.algebra import AbstractOperator, Composition
 from ..stencils.stencil import Stencil
 from .precondition import AbstractPreconditioner
-from .reduced import check_kinds, free_operator
+from .reduced import check_kinds, free_operator, restriction_of
 
 
 class System(eqx.Module):
@@ -39,7 +39,7 @@ class System(eqx.Module):
         if not mean_zero:
             return plain
         # σ of the size and sign that keep the new eigenvalue among the others.
-        signs = plain.free(1.0 - 2.0 * (jnp.arange(operator.n) % 2).astype(dtype))
+        signs = plain.restriction(1.0 - 2.0 * (jnp.arange(operator.n) % 2).astype(dtype))
         size = -jnp.vdot(signs, plain.reduced(signs)) / jnp.vdot(signs, signs)
         return cls(operator, conditions, jax.lax.stop_gradient(jnp.where(size == 0, 1, size)))
 
@@ -50,9 +50,9 @@ class System(eqx.Module):
 
     @property
     def matrix(self) -> AbstractOperator:
-        matrix = self.reduced
-        if not self._all_free:
-            matrix = matrix + (1 - self.restriction)
+        matrix, restriction = free_operator(self.operator, self.conditions)
+        if not restriction.all_free:
+            matrix = matrix + (1 - restriction)
         return matrix if self.sigma is None else matrix - self.sigma * self.averaging
 
     def inverse(self, preconditioner: AbstractPreconditioner) -> AbstractOperator:
@@ -65,16 +65,12 @@ class System(eqx.Module):
     @property
     def restriction(self) -> Restriction:
         """P."""
-        return Restriction(self.operator.n, self.conditions, self.operator.active)
+        return restriction_of(self.operator, self.conditions)
 
     @property
     def averaging(self) -> Averaging:
         """p pᵀ / pᵀ p."""
         return Averaging(self.restriction)
-
-    @property
-    def _all_free(self) -> bool:
-        return self.conditions is None and self.operator.active is None
 
     def spread(self) -> Float[Array, "*n"]:
         """One over half the row sums of moduli: the square of a distance for a Laplacian."""
@@ -86,13 +82,9 @@ class System(eqx.Module):
         half = jnp.sum(jnp.abs(outer.weights), axis=0) / 2
         return 1 / jnp.where(half > 0, half, 1)
 
-    def free(self, v):
-        """P v."""
-        return self.restriction(v)
-
     def constant(self, value, dtype):
         """p times a number."""
-        return self.free(jnp.broadcast_to(jnp.asarray(value, dtype), self.operator.n))
+        return self.restriction(jnp.broadcast_to(jnp.asarray(value, dtype), self.operator.n))
 
     def mean(self, v):
         """Over free points."""
@@ -115,9 +107,7 @@ class Averaging(AbstractOperator):
     in_shape = ()
     out_shape = ()
 
-    @property
-    def n(self):
-        return self.restriction.n
+    n = property(lambda self: self.restriction.n)
 
     def mean(self, v):
         return jnp.sum(self.restriction(v)) / self.restriction.count

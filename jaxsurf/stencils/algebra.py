@@ -307,10 +307,7 @@ class Sum(AbstractOperator):
     out_shape = property(lambda self: self.one.out_shape)
     border = property(lambda self: either(self.one.border, self.other.border))
     active = property(lambda self: both(self.one.active, self.other.active))
-
-    @property
-    def diagonal(self):
-        return self.one.diagonal + self.other.diagonal
+    diagonal = property(lambda self: self.one.diagonal + self.other.diagonal)
 
     def __call__(self, u):
         return self.one(u) + self.other(u)

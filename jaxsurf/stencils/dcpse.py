@@ -67,13 +67,8 @@ class DCPSE(AbstractMethod):
         _, high = _degrees(target.order, self.order)
         return polynomial_count(dim - 1, high)
 
-    @property
-    def batch_size(self):
-        return 64 if self.order < 3 else 32
-
-    @property
-    def polynomial_degree(self):
-        return max(self.order, 2)
+    batch_size = property(lambda self: 64 if self.order < 3 else 32)
+    polynomial_degree = property(lambda self: max(self.order, 2))
 
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
         k, dim = neighborhood.offsets.shape[:2]
@@ -131,9 +126,7 @@ class FlatDCPSE(AbstractMethod):
         _, high = _degrees(target.order, self.order)
         return polynomial_count(dim, high)
 
-    @property
-    def batch_size(self):
-        return 64
+    batch_size = 64
 
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
         x = jnp.swapaxes(neighborhood.offsets, 0, 1)

@@ -92,9 +92,9 @@ def sum_slots(weights, indices, values, contracted: int):
 
     if is_quick():
         return _scan_slots(weights, indices, values, contracted)
-    groups, rest = divmod(len(indices), _GROUP)
+    groups, left = divmod(len(indices), _GROUP)
     total = jax.lax.fori_loop(0, groups, add_group, _zero(weights, values, contracted))
-    for slot in range(len(indices) - rest, len(indices)):
+    for slot in range(len(indices) - left, len(indices)):
         total = add(slot, total)
     return total
 

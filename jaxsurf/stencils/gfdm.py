@@ -62,23 +62,14 @@ class GFDM(AbstractMethod):
     def basis_size(self, dim, target):
         return needed_polynomials(self.degree, dim, target)
 
-    @property
-    def batch_size(self):
-        return 256
-
-    @property
-    def polynomial_degree(self):
-        return max(self.degree, 2)
-
-    @property
-    def shares_moments(self):
-        return True
+    batch_size = 256
+    polynomial_degree = property(lambda self: max(self.degree, 2))
+    shares_moments = True
 
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
         plane = TangentPlane.of(neighborhood, self.degree, width=self.width, support=self.support)
         b = jnp.asarray(target.moments(len(plane.points), 1, self.degree), plane.points.dtype)
-        solved = moment_solve(plane.points, plane.weights, b, 1, self.degree)
-        eta, condition, residual = solved
+        eta, condition, residual = moment_solve(plane.points, plane.weights, b, 1, self.degree)
         eta = with_center(target.in_units(eta, plane.width, len(plane.points)))
         diagnostics = Diagnostics.of(neighborhood, condition, residual, plane.radius, 0)
         return target.assemble(eta, plane.tangents), diagnostics

@@ -233,9 +233,9 @@ def _table(indices: np.ndarray) -> Table:
     other = target != np.arange(n, dtype=np.int32)[:, None]
     indptr = np.append(0, np.cumsum(other.sum(axis=1)))
     matrix = scipy.sparse.csr_matrix((number[other], target[other], indptr), shape=(n, n))
-    turned = matrix.tocsc()
+    transposed = matrix.tocsc()
     # A point is read about as often as it reads.
-    table = tabulate(turned.indptr, turned.indices, turned.data, width=1.15 * k)
+    table = tabulate(transposed.indptr, transposed.indices, transposed.data, width=1.15 * k)
     own, none = np.arange(n, dtype=np.int32), np.full(n, np.iinfo(np.int32).max, np.int32)
     return table._replace(
         columns=np.concatenate([own[None], table.columns]),

@@ -54,10 +54,10 @@ class RBFFD(AbstractMethod):
         return needed_polynomials(self.degree, dim, target)
 
     power = property(lambda self: self.exponent or min(self.degree + 1 + self.degree % 2, 7))
-    batch_size = property(lambda self: 64)
+    batch_size = 64
     polynomial_degree = property(lambda self: max(self.degree, 2))
-    shares_moments = property(lambda self: True)
-    least_dominance = property(lambda self: 0.0)  # as stable as with more, `experiments.stability`
+    shares_moments = True
+    least_dominance = 0.0  # as stable as with more, `experiments.stability`
 
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
         tangents = tangent_frames(neighborhood.normals[0].T)[..., :-1, :]  # points first: LAPACK

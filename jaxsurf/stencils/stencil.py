@@ -158,6 +158,11 @@ class Stencil(AbstractOperator):
         value = per_point(value, self.n, name).astype(self.weights.dtype)
         return switched_off(self.active, value) if value.ndim else value
 
+    def of_weights(self, weights, out_shape=(), in_shape=()) -> Stencil:
+        """Another operator on the same slots, whose weights were computed from these."""
+        known = (self.diagnostics, self.border, self.active)
+        return Stencil(self.indices, weights, out_shape, in_shape, *known)
+
     def _with(self, weights) -> Stencil:
         return eqx.tree_at(lambda s: s.weights, self, weights)
 
@@ -184,10 +189,8 @@ class Stencil(AbstractOperator):
         }
         if self.diagnostics is not None:
             data |= {name: np.asarray(value) for name, value in vars(self.diagnostics).items()}
-        if self.border is not None:
-            data["border"] = np.asarray(self.border)
-        if self.active is not None:
-            data["active"] = np.asarray(self.active)
+        marks = {"border": self.border, "active": self.active}
+        data |= {name: np.asarray(mark) for name, mark in marks.items() if mark is not None}
         with open(path, "wb") as file:
             np.savez(file, **data)  # type: ignore[arg-type]
 

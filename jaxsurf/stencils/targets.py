@@ -103,9 +103,7 @@ class Joint(AbstractTarget):
 
     targets: tuple[AbstractTarget, ...]
 
-    @property
-    def order(self):
-        return max(target.order for target in self.targets)
+    order = property(lambda self: max(target.order for target in self.targets))
 
     def columns(self, dim, high):
         return [column for target in self.targets for column in target.columns(dim, high)]
@@ -131,9 +129,7 @@ class Partial(AbstractTarget):
 
     alpha: tuple[int, ...] = eqx.field(static=True)
 
-    @property
-    def order(self):
-        return sum(self.alpha)
+    order = property(lambda self: sum(self.alpha))
 
     def columns(self, dim, high):
         return [derivative_at_origin(dim, high, self.alpha)]

@@ -14,7 +14,7 @@ from jaxtyping import Array, PyTree
 
 from ..arguments import as_float, real
 from ..boundary import check_border
-from ..failures import is_concrete, raise_at
+from ..failures import check, is_concrete, not_finite, raise_at
 from ..stencils.algebra import AbstractOperator
 from .higher import WaveEquation
 from .problem import AbstractEvolution
@@ -47,9 +47,7 @@ def checked_state(problem: AbstractEvolution, u0: Any) -> PyTree[Array]:
             raise ValueError(f"u0 has shape {leaf.shape}, expected {want}")
         if n is not None and (leaf.shape[0] != n or leaf.ndim > 2):
             raise ValueError(f"u0 has shape {leaf.shape}, expected ({n},) or ({n}, c)")
-        if is_concrete(leaf):
-            values = np.asarray(leaf)
-            raise_at(bad_rows(values), "the state at point {i} is not finite: {v}", values)
+        check(leaf, not_finite, "the state at point {i} is not finite: {v}")
     if pair and u0[0].shape != u0[1].shape:
         shapes = f"{u0[0].shape} and {u0[1].shape}"
         raise ValueError(f"u0 has shapes {shapes}, expected values and velocities of one shape")
@@ -156,8 +154,3 @@ def check_coefficients(problem: AbstractEvolution, t0, t1) -> None:
     if is_concrete(t0, t1):
         problem.check(t0)
         problem.check(t1)
-
-
-def bad_rows(values: np.ndarray) -> np.ndarray:
-    """Which rows have an entry that is not finite."""
-    return ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)

@@ -24,6 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from .states import added, dtype_of
+
 Loop = Literal["checkpointed", "lax", "bounded"]
 
 # Damping of the stability polynomial: the strip around the negative real axis that it covers.
@@ -82,8 +84,7 @@ def last_stage(
         max_stages: the largest number there may be.
         loop: how it can be differentiated, see `RKC2`.
     """
-    dtype = jnp.result_type(*jax.tree.leaves(y0))
-    rows = jnp.asarray(table(max_stages), dtype)[stages]
+    rows = jnp.asarray(table(max_stages), dtype_of(y0))[stages]
     if loop == "checkpointed":
         increment = eqx.filter_closure_convert(increment, rows[0, _NODE], y0)
         return _last((increment, y0, k0), rows, stages)
@@ -190,9 +191,9 @@ def _last_reverse(residuals, cotangent, perturbed, inputs, rows, stages):
             mu, nu = row[_MU], row[_NU]
             w_part, y_part = pulled(j, _get(kept, m), _scaled(row[_MU_K], y_bar))
             sums = (
-                _sum(w_bar, w_part),
-                _sum(y0_bar, _scaled(1 - mu - nu, y_bar)),
-                _sum(k0_bar, _scaled(row[_GAMMA_K], y_bar)),
+                added(w_bar, w_part),
+                added(y0_bar, _scaled(1 - mu - nu, y_bar)),
+                added(k0_bar, _scaled(row[_GAMMA_K], y_bar)),
             )
             last = jax.tree.map(lambda z, y, p: z + mu * y + p, z_bar, y_bar, y_part)
             return (last, _scaled(nu, y_bar)), sums
@@ -209,13 +210,9 @@ def _last_reverse(residuals, cotangent, perturbed, inputs, rows, stages):
     _, (y1_bar, start_bar), (w_bar, y0_bar, k0_bar) = jax.lax.while_loop(
         lambda carry: carry[0] >= 0, interval, carry
     )
-    y0_bar = jax.tree.map(lambda a, b, c: a + b + c, y0_bar, start_bar, y1_bar)
-    k0_bar = _sum(k0_bar, _scaled(rows[1, _MU_K], y1_bar))
+    y0_bar = added(y0_bar, start_bar, y1_bar)
+    k0_bar = added(k0_bar, _scaled(rows[1, _MU_K], y1_bar))
     return w_bar, eqx.filter(y0_bar, perturbed[1]), eqx.filter(k0_bar, perturbed[2])
-
-
-def _sum(a: PyTree[Array], b: PyTree[Array]) -> PyTree[Array]:
-    return jax.tree.map(jnp.add, a, b)
 
 
 def _scaled(factor, y: PyTree[Array]) -> PyTree[Array]:

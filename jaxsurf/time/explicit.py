@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from ..arguments import real, whole
-from ..functions import numbers_as_arrays
+from ..functions import constant, numbers_as_arrays
 from .chebyshev import Loop, last_stage
-from .states import dtype_of, frozen, length, small
+from .states import dtype_of, length, small
 
 # Steps between two estimates of the spectral radius, applications in the first and in later ones.
 _REFRESH, _FIRST, _LATER = 25, 20, 4
@@ -164,7 +164,7 @@ def after_jump(made_jump, rate: PyTree[Array], fresh: Callable[[], PyTree[Array]
 
 def _power(terms, t, y, args, rate, direction, count: int):
     """Spectral radius of the Jacobian by power iterations on differences, and its direction."""
-    terms, y, args, rate, direction = frozen((terms, y, args, rate, direction))
+    terms, y, args, rate, direction = constant((terms, y, args, rate, direction))
     size = small(y)
 
     def multiply(carry, _):
@@ -177,7 +177,7 @@ def _power(terms, t, y, args, rate, direction, count: int):
         return (kept, stretched), None
 
     (v, radius), _ = jax.lax.scan(multiply, (direction, jnp.zeros_like(size)), length=count)
-    return frozen((_SAFETY * radius, v))
+    return constant((_SAFETY * radius, v))
 
 
 def _noise(y: Array) -> Array:

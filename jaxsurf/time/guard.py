@@ -61,17 +61,9 @@ class GuardedAdaptive(Guarded, dfx.AbstractAdaptiveStepSizeController):
     controller: dfx.AbstractAdaptiveStepSizeController
     guard: Guard
 
-    @property  # type: ignore[misc]
-    def rtol(self):  # type: ignore[override]
-        return self.controller.rtol
-
-    @property  # type: ignore[misc]
-    def atol(self):  # type: ignore[override]
-        return self.controller.atol
-
-    @property  # type: ignore[misc]
-    def norm(self):  # type: ignore[override]
-        return self.controller.norm
+    rtol = property(lambda self: self.controller.rtol)  # type: ignore[assignment]
+    atol = property(lambda self: self.controller.atol)  # type: ignore[assignment]
+    norm = property(lambda self: self.controller.norm)  # type: ignore[assignment]
 
 
 def guarded(controller: dfx.AbstractStepSizeController, guard: Guard) -> Guarded:

@@ -18,7 +18,7 @@ from ..functions import numbers_as_arrays
 from .explicit import after_jump
 from .phases import frozen_at
 from .relative import relative, tolerance_of
-from .states import dtype_of, root_mean_square
+from .states import added, dtype_of, root_mean_square
 
 Preconditioner = Callable[[Any], lx.AbstractLinearOperator]
 
@@ -93,7 +93,34 @@ _SDIRK = {
 }
 
 
-class IMEX(dfx.AbstractAdaptiveSolver):
+class _Implicit(dfx.AbstractAdaptiveSolver):
+    """What `IMEX` and `SDIRK` are set up with."""
+
+    scheme: int = eqx.field(static=True)
+    solver: lx.AbstractLinearSolver | None
+    tolerance: ArrayLike | None
+    preconditioner: Preconditioner | None
+
+    interpolation_cls: ClassVar = dfx.ThirdOrderHermitePolynomialInterpolation
+
+    def _set(self, order: int, schemes: dict, solver, tolerance, preconditioner):
+        if whole(order, "order") not in schemes:
+            raise ValueError(f"order = {order}, there are {', '.join(map(str, sorted(schemes)))}")
+        if solver is not None:
+            instance(solver, lx.AbstractLinearSolver, "solver", "one of lineax, like lx.GMRES(...)")
+        if tolerance is not None:
+            tolerance = numbers_as_arrays(real(tolerance, "tolerance", above=0, below=1))
+        if preconditioner is not None and not callable(preconditioner):
+            kind = type(preconditioner).__name__
+            raise TypeError(f"preconditioner is a {kind}, expected a function of γ Δt")
+        self.scheme, self.solver = order, solver
+        self.tolerance, self.preconditioner = tolerance, preconditioner
+
+    def order(self, terms):
+        return self.scheme
+
+
+class IMEX(_Implicit):
     r"""Implicit–explicit Runge–Kutta steps: the stiff linear part L implicit, the rest explicit.
 
     Each stage solves $(I - \gamma\,\Delta t\,L)\,y = r$ by a Krylov method on the action of L.
@@ -126,13 +153,7 @@ class IMEX(dfx.AbstractAdaptiveSolver):
         True
     """
 
-    scheme: int = eqx.field(static=True)
-    solver: lx.AbstractLinearSolver | None
-    tolerance: ArrayLike | None
-    preconditioner: Preconditioner | None
-
     term_structure: ClassVar = dfx.MultiTerm[tuple[dfx.AbstractTerm, dfx.AbstractTerm]]
-    interpolation_cls: ClassVar = dfx.ThirdOrderHermitePolynomialInterpolation
 
     def __init__(
         self,
@@ -142,16 +163,10 @@ class IMEX(dfx.AbstractAdaptiveSolver):
         tolerance: ArrayLike | None = None,
         preconditioner: Preconditioner | None = None,
     ):
-        self.scheme = _known(order, _IMEX)
-        self.solver, self.tolerance, self.preconditioner = _checked(
-            solver, tolerance, preconditioner
-        )
-
-    def order(self, terms):
-        return self.scheme
+        self._set(order, _IMEX, solver, tolerance, preconditioner)
 
     def func(self, terms, t0, y0, args):
-        return _sum([term.vf(t0, y0, args) for term in terms.terms])
+        return added(*(term.vf(t0, y0, args) for term in terms.terms))
 
     def init(self, terms, t0, t1, y0, args):
         return tuple(term.vf(t0, y0, args) for term in terms.terms)
@@ -171,8 +186,8 @@ class IMEX(dfx.AbstractAdaptiveSolver):
                 return jax.tree.map(lambda y, k: y - tableau.gamma * k, y, change)
 
             operator = lx.FunctionLinearOperator(left_side, jax.eval_shape(lambda: y0))
-            rest = jax.tree.map(jnp.subtract, known, operator.mv(start))
-            found = lx.linear_solve(operator, rest, solver, options=options, throw=False)
+            residual = jax.tree.map(jnp.subtract, known, operator.mv(start))
+            found = lx.linear_solve(operator, residual, solver, options=options, throw=False)
             y = jax.tree.map(jnp.add, start, found.value)
             return y, dfx.RESULTS.promote(found.result)
 
@@ -180,7 +195,7 @@ class IMEX(dfx.AbstractAdaptiveSolver):
         return _steps(tableau, rates, solve, t0, t1, y0, args, solver_state, made_jump)
 
 
-class SDIRK(dfx.AbstractAdaptiveSolver):
+class SDIRK(_Implicit):
     r"""Singly diagonally implicit Runge–Kutta steps by Newton–Krylov: for stiff reactions.
 
     Each stage solves $y - \gamma\,\Delta t\,f(t, y) = r$ for the whole right-hand side f by
@@ -214,14 +229,9 @@ class SDIRK(dfx.AbstractAdaptiveSolver):
         True
     """
 
-    scheme: int = eqx.field(static=True)
-    solver: lx.AbstractLinearSolver | None
-    tolerance: ArrayLike | None
-    preconditioner: Preconditioner | None
     newton_steps: int = eqx.field(static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
-    interpolation_cls: ClassVar = dfx.ThirdOrderHermitePolynomialInterpolation
 
     def __init__(
         self,
@@ -232,14 +242,8 @@ class SDIRK(dfx.AbstractAdaptiveSolver):
         preconditioner: Preconditioner | None = None,
         newton_steps: int = 12,
     ):
-        self.scheme = _known(order, _SDIRK)
-        self.solver, self.tolerance, self.preconditioner = _checked(
-            solver, tolerance, preconditioner
-        )
+        self._set(order, _SDIRK, solver, tolerance, preconditioner)
         self.newton_steps = whole(newton_steps, "newton_steps", least=1)
-
-    def order(self, terms):
-        return self.scheme
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)
@@ -342,7 +346,7 @@ def _steps(tableau: Tableau, terms, solve, t0, t1, y0, args, rates, made_jump):
     fine = dfx.RESULTS.successful
     start = (y0, room, dfx.RESULTS.where(jnp.asarray(True), fine, fine))
     (_, room, ok), _ = jax.lax.scan(stage, start, rows)
-    total = _sum(room)
+    total = added(*room)
     y1 = _combined(y0, jnp.asarray(tableau.weights, real), total)
     zero = jax.tree.map(jnp.zeros_like, y0)
     error = _combined(zero, jnp.asarray(tableau.errors, real), total)
@@ -350,31 +354,10 @@ def _steps(tableau: Tableau, terms, solve, t0, t1, y0, args, rates, made_jump):
     error = jax.tree.map(lambda e: jnp.where(ok == fine, e, jnp.inf), error)
     y1 = jax.tree.map(lambda y: jnp.where(ok == fine, y, jnp.nan), y1)
     rates = tuple(term.vf(t1, y1, args) for term in terms)
-    k1 = _sum([term.prod(rate, s) for term, rate, s in zip(terms, rates, span)])
-    return y1, error, dict(y0=y0, y1=y1, k0=_sum(first), k1=k1), rates, ok
+    k1 = added(*(term.prod(rate, s) for term, rate, s in zip(terms, rates, span)))
+    return y1, error, dict(y0=y0, y1=y1, k0=added(*first), k1=k1), rates, ok
 
 
 def _combined(y: PyTree[Array], weights: Array, increments: PyTree[Array]) -> PyTree[Array]:
     """y plus the weighted sum of increments that are stacked along the first axis."""
     return jax.tree.map(lambda y, k: y + jnp.tensordot(weights, k, axes=1), y, increments)
-
-
-def _sum(trees: Sequence[PyTree[Array]]) -> PyTree[Array]:
-    return jax.tree.map(lambda *leaves: sum(leaves[1:], leaves[0]), *trees)
-
-
-def _checked(solver, tolerance, preconditioner):
-    if solver is not None:
-        instance(solver, lx.AbstractLinearSolver, "solver", "one of lineax, like lx.GMRES(...)")
-    if tolerance is not None:
-        tolerance = numbers_as_arrays(real(tolerance, "tolerance", above=0, below=1))
-    if preconditioner is not None and not callable(preconditioner):
-        kind = type(preconditioner).__name__
-        raise TypeError(f"preconditioner is a {kind}, expected a function of γ Δt")
-    return solver, tolerance, preconditioner
-
-
-def _known(order: int, table: dict) -> int:
-    if whole(order, "order") not in table:
-        raise ValueError(f"order = {order}, there are {', '.join(map(str, sorted(table)))}")
-    return order

@@ -10,13 +10,11 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
 from ..arguments import instance, real
-from ..failures import raise_at
+from ..failures import check, not_finite
 from ..functions import numbers_as_arrays
-from .asked import bad_rows
 from .checkpoint import Checkpoint, integrate_in_parts
 from .problem import AbstractEvolution
 from .run import Plan, Run, planned, solve
@@ -230,9 +228,7 @@ def _check_start(run: Run) -> None:
     parts = run.terms.terms if isinstance(run.terms, dfx.MultiTerm) else (run.terms,)
     for term in parts:
         for leaf in jax.tree.leaves(eqx.filter_jit(term.vf)(run.t0, run.u0, run.args)):
-            values = np.asarray(leaf)
-            message = "the right-hand side at point {i} is not finite: {v}"
-            raise_at(bad_rows(values), message, values)
+            check(leaf, not_finite, "the right-hand side at point {i} is not finite: {v}")
 
 
 def _reason(plan: Plan, run: Run, solution: dfx.Solution, t: float, state) -> str:

@@ -18,7 +18,7 @@ from ..failures import is_concrete
 from ..stencils.algebra import AbstractOperator
 from .coefficients import InTime, user
 from .implicit import IMEX
-from .states import only_on
+from .states import added, only_on
 
 Field = Float[Array, "n *c"]
 
@@ -141,7 +141,7 @@ class AbstractEvolution(eqx.Module):
         """The whole right-hand side, for explicit and for fully implicit solvers."""
         u = self.closed(t, u)
         now = self.at(t, u)
-        return now._free(_add(now.linear(t, u), now.rest(t, u, args)))
+        return now._free(added(now.linear(t, u), now.rest(t, u, args)))
 
     def implicit_rate(self, t, u: PyTree[Array], args) -> PyTree[Array]:
         """The part for implicit steps, linear in u: P L E u."""
@@ -154,7 +154,7 @@ class AbstractEvolution(eqx.Module):
         if self.conditions is None:
             return self._free(rest)
         none = self.closed(t, jax.tree.map(jnp.zeros_like, u))
-        return self._free(_add(rest, self.linear(t, none)))
+        return self._free(added(rest, self.linear(t, none)))
 
     def _free(self, rate: PyTree[Array]) -> PyTree[Array]:
         rate = only_on(self.active, rate)
@@ -181,12 +181,8 @@ def at_time(value: InTime, name: str, t):
     return user(value, name, t) if callable(value) else value
 
 
-def _add(a: PyTree, b: PyTree) -> PyTree:
-    return jax.tree.map(jnp.add, a, b)
-
-
 def per_point(values: ArrayLike, field: Array, keep: int = 0) -> Array:
-    """Values `(n, *rest)`, `rest` of `keep` axes, with axes inserted to go with a field."""
+    """Values `(n, *kept)`, `keep` axes of them, with axes inserted to go with a field."""
     values = jnp.asarray(values)
     if values.ndim == 0:
         return values

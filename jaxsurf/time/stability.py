@@ -19,7 +19,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from .states import frozen, length, small
+from ..functions import constant
+from .states import length, small
 
 # Arnoldi steps; a run is refused in which a mode is amplified so many times beyond what it should.
 _STEPS, _AMPLIFIED = 24, 2.0
@@ -92,7 +93,7 @@ def check_steps(tableau: Tableau, rate: Callable, t, u: PyTree[Array], args, dt,
         dt, span: lengths in time.
     """
     h = projected(rate, t, u, args)
-    dt, span = frozen((jnp.abs(dt), jnp.abs(span)))
+    dt, span = constant((jnp.abs(dt), jnp.abs(span)))
     one = jnp.eye(len(h), dtype=h.dtype)
     z = dt * h
     size = jnp.maximum(jnp.max(jnp.sum(jnp.abs(z), axis=1)), 1)
@@ -107,7 +108,7 @@ def check_steps(tableau: Tableau, rate: Callable, t, u: PyTree[Array], args, dt,
 
 def projected(rate: Callable, t, u: PyTree[Array], args) -> Float[Array, "m m"]:
     """The Jacobian of the right-hand side on the Krylov space of a random state."""
-    rate, t, u, args = frozen((rate, t, u, args))
+    rate, t, u, args = constant((rate, t, u, args))
     base, unravel = ravel_pytree(u)
     value, size = ravel_pytree(rate(t, u, args))[0], small(base)
 

@@ -111,10 +111,8 @@ def upwinding(
     """
     instance(cloud, PointCloud, "cloud")
     instance(method, AbstractMethod, "method", "like js.DCPSE(order=2)")
-    velocity = finite(as_float(velocity, "velocity"), "velocity", cloud.active)
-    velocity = switched_off(cloud.active, velocity)
-    if velocity.shape != cloud.points.shape:
-        raise ValueError(f"velocity has shape {velocity.shape}, expected {cloud.points.shape}")
+    velocity = as_float(velocity, "velocity", cloud.points.shape)
+    velocity = switched_off(cloud.active, finite(velocity, "velocity", cloud.active))
     real(strength, "strength", least=0)
     spacing = cloud.seen.spacing
     if spacing is None:

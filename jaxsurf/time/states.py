@@ -1,4 +1,4 @@
-"""States in time as vectors: their size, and constants to differentiation."""
+"""States in time as vectors: sums, norms, types."""
 
 from __future__ import annotations
 
@@ -21,6 +21,11 @@ def root_mean_square(y: PyTree[Array]) -> Float[Array, ""]:
     return length(y) / max(sum(leaf.size for leaf in jax.tree.leaves(y)), 1) ** 0.5
 
 
+def added(*trees: PyTree[Array]) -> PyTree[Array]:
+    """The sum of states, or of rates."""
+    return jax.tree.map(lambda first, *others: sum(others, first), *trees)
+
+
 def only_on(active: Bool[Array | np.ndarray, " n"] | None, tree: PyTree) -> PyTree:
     """A state or a rate with zeros in the rows of points that are switched off."""
     if active is None:
@@ -39,16 +44,10 @@ class Norm(eqx.Module):
         return root_mean_square(only_on(self.active, y)) / jnp.sqrt(share).astype(dtype_of(y))
 
 
-def frozen(tree: PyTree) -> PyTree:
-    """The same values, constants to differentiation."""
-    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
-
-
 def small(y: PyTree[Array]) -> Float[Array, ""]:
     """The length of a step for differences at a state, in the scale of the state."""
     size = length(y)
-    dtype = jnp.result_type(*jax.tree.leaves(y))
-    return jnp.sqrt(jnp.finfo(dtype).eps) * jnp.where(size > 0, size, 1)
+    return jnp.sqrt(jnp.finfo(dtype_of(y)).eps) * jnp.where(size > 0, size, 1)
 
 
 def dtype_of(y: PyTree[Array]):

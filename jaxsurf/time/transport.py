@@ -133,9 +133,7 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         """True with a velocity."""
         return self.velocity is not None
 
-    @property
-    def diffusive(self):
-        return self.laplacian is not None
+    diffusive = property(lambda self: self.laplacian is not None)
 
     @property
     def contractive(self):
@@ -232,21 +230,16 @@ def _along(gradient: Stencil, velocity, conservative: bool) -> Stencil:
     r"""$u \mapsto \nabla\cdot(v\,u)$ or $v\cdot\nabla u$ as one stencil."""
     v = velocity
     v = jnp.moveaxis(take(v, gradient.indices), -1, 1) if conservative else v.T[None]
-    weights = jnp.sum(gradient.weights * v, axis=1)
-    known = (gradient.diagnostics, gradient.border, gradient.active)
-    return Stencil(gradient.indices, weights, (), (), *known)
+    return gradient.of_weights(jnp.sum(gradient.weights * v, axis=1))
 
 
 def _advected(gradient: Stencil, velocity, u: Field, conservative: bool) -> Field:
     v = per_point(_checked_velocity(velocity, gradient), u[..., None], keep=1)
     if conservative:
-        divergence = divergence_of(gradient)
-        return divergence(u[..., None] * v)
+        return divergence_of(gradient)(u[..., None] * v)
     return jnp.sum(gradient(u) * v, axis=-1)
 
 
 def _checked_velocity(velocity, gradient: Stencil) -> Array:
-    velocity, want = as_float(velocity, "velocity"), (gradient.n, *gradient.out_shape)
-    if velocity.shape != want:
-        raise ValueError(f"velocity has shape {velocity.shape}, expected {want}")
+    velocity = as_float(velocity, "velocity", (gradient.n, *gradient.out_shape))
     return switched_off(gradient.active, finite(velocity, "velocity", gradient.active))

@@ -70,12 +70,15 @@ def test_mass_is_conserved_to_round_off():
 
 
 def test_derivatives():
-    """In the points, through weights of the operator and areas."""
-    probe = jnp.cos(jnp.arange(400.0))
+    """In the points, through weights of the operator, and in the total.
+
+    Those of areas and of normals carried along: `test_discretization.py`.
+    """
+    probe, normals = jnp.cos(jnp.arange(400.0)), SURFACE.cloud.normals
 
     def f(points):
-        moved = SURFACE.moved(points)
-        total = jnp.sum(moved.areas)
+        moved = SURFACE.moved(points, normals)
+        total = jnp.sum(points[:, 1] ** 2)
         m = js.conservative_weights(moved.laplacian, total, preconditioner=CYCLE)
         return jnp.vdot(probe * points[:, 2], m)
 

@@ -15,7 +15,7 @@ from jaxsurf.frames import tangent_frames
 from jaxsurf.neighbors import Neighbors, find_neighbors
 from jaxsurf.normals import estimate_normals, from_points, refit_normals
 
-from .helpers import check_derivative
+from .helpers import check_derivatives
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -431,8 +431,7 @@ def test_gradients_on_plane_curves():
         fitted = refit_normals(points, normals, neighbors, degree=4, iterations=1)
         return jnp.vdot(weights, fitted) + jnp.sum(tangent_frames(fitted)[:, 0] ** 3)
 
-    check_derivative(lambda x: value(x, normals), points)
-    check_derivative(lambda m: value(points, m), normals + 0.05 * weights / 3)
+    check_derivatives(value, points, normals + 0.05 * weights / 3)
 
 
 def test_gradient_of_frames():
@@ -442,7 +441,7 @@ def test_gradient_of_frames():
     def value(x):
         return jnp.vdot(weights, tangent_frames(x / jnp.linalg.norm(x, axis=1, keepdims=True)))
 
-    check_derivative(value, normals)
+    check_derivatives(value, normals)
 
 
 def test_single_precision_without_x64():

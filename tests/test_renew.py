@@ -1,5 +1,6 @@
 """Neighbours of moved points in compiled code: the lists, sizes and operators of the host."""
 
+import dataclasses
 import functools
 
 import equinox as eqx
@@ -11,6 +12,7 @@ import scipy.linalg
 
 import jaxsurf as js
 from jaxsurf.nearest import Grid, nearest_in
+from jaxsurf.renew import Tier
 
 from .helpers import check_derivatives, count_compilations, jittered_sphere, random_sphere
 
@@ -51,6 +53,19 @@ def found(surface, cloud, search):
     return moved, moved.laplacian, moved.code
 
 
+def roomiest(searches):
+    """One with room for all: a program for several clouds."""
+    tiers = [Tier(*map(max, zip(*same))) for same in zip(*(search.tiers for search in searches))]
+    return dataclasses.replace(searches[0], tiers=tuple(tiers))
+
+
+@functools.cache
+def room():
+    clouds = jittered_sphere(600), js.torus(600, 1.0, 0.4)
+    surfaces = [js.discretize(c, js.find_neighbors(c, 36), method=METHOD) for c in clouds]
+    return roomiest([surface.search(margin=3, slots=122) for surface in surfaces])
+
+
 def lists(neighbors):
     """Each as the numbers in it, in their order."""
     return [
@@ -73,8 +88,7 @@ def moving(request):
 
 def test_lists_sizes_and_operators_of_the_host(moving):
     cloud, motions = moving
-    surface = js.discretize(cloud, method=METHOD)
-    search = surface.search(margin=3, slots=122)
+    surface, search = js.discretize(cloud, js.find_neighbors(cloud, 36), method=METHOD), room()
     for i, motion in enumerate(motions):
         there = carried(motion, cloud)
         if cloud.active is not None:
@@ -151,8 +165,11 @@ def test_nearest_of_curves_and_of_lattices(dtype):
 def test_what_has_no_room_or_is_out_of_reach_has_a_code():
     cloud = jittered_sphere(600)
     surface = js.discretize(cloud, method=METHOD)
-    normals, search = cloud.normals, surface.search(margin=1.2, slots=40)
-    call = jax.jit(lambda x, n: surface.moved(x, n, search=search))
+    rough = random_sphere(600)
+    narrow = js.discretize(rough, js.find_neighbors(rough, 36), method=METHOD)
+    normals, search = cloud.normals, narrow.search(margin=2, slots=40)
+    moved = jax.jit(lambda surface, x, n: surface.moved(x, n, search=search))
+    call = functools.partial(moved, surface)
     code = jax.jit(lambda s: s.code)
     still = call(cloud.points, normals)
     assert not code(still).any()
@@ -177,9 +194,7 @@ def test_what_has_no_room_or_is_out_of_reach_has_a_code():
     assert (code(call(folded, turned)) == 2).any()
     assert code(call(cloud.points.at[3].set(jnp.nan), normals))[3] == 1
     # Adapted neighbourhoods that the lists are too short for; 122 slots serve: `test_mapped`.
-    rough = random_sphere(600)
-    narrow = js.discretize(rough, js.find_neighbors(rough, 36), method=METHOD)
-    assert (found(narrow, rough, narrow.search(margin=2, slots=36))[2] == 5).any()
+    assert (code(moved(narrow, rough.points, rough.normals)) == 5).any()
 
 
 def test_kept_lists_reach_as_long_as_the_surface_is_not_stretched_one_way():
@@ -265,9 +280,12 @@ def test_a_moved_cloud_is_as_stable_as_a_new_one(degree):
     many = random_sphere(4_000)
     spread = js.poisson_disk(many.points, 0.12, normals=many.normals)
     disk = js.PointCloud(many.points[spread], many.normals[spread])
-    for start in (jittered_sphere(500), random_sphere(500), disk):
-        surface = js.discretize(start, method=method)
-        search = surface.search(margin=3, slots=3 * surface.neighbors.k)
+    # As many points, lists as long and one search: one program.
+    starts = [disk, jittered_sphere(disk.n), random_sphere(disk.n)]
+    k = method.neighbor_count(3)
+    surfaces = [js.discretize(c, js.find_neighbors(c, k), method=method) for c in starts]
+    search = roomiest([surface.search(margin=3, slots=4 * k) for surface in surfaces])
+    for start, surface in zip(starts, surfaces):
         for seed in (0, 1):
             there = carried(functools.partial(smooth, seed=seed, size=0.1), start)
             _, laplacian, code = found(surface, there, search)

@@ -19,7 +19,7 @@ from jaxsurf.shapes.level_sets import double_torus, level_set
 from jaxsurf.shapes.parametric import graph, surface_of_revolution
 from jaxsurf.shapes.spacing import ideal_spacing, measure_quality
 
-from .helpers import check_derivative, count_compilations
+from .helpers import check_derivatives, count_compilations
 
 
 def sphere_phi(x):
@@ -462,8 +462,7 @@ def test_gradients_in_points_and_parameters(function):
         mean, gauss = level_set_curvature(ellipsoid_of(axes), points)
         return weights[0, :, 0] @ mean + weights[1, :, 0] @ gauss
 
-    check_derivative(lambda x: value(axes, x), points)
-    check_derivative(lambda a: value(a, points), axes)
+    check_derivatives(value, axes, points)
     two = jnp.stack([points, 1.1 * points])
     mapped = jax.jit(jax.vmap(value, in_axes=(None, 0)))(axes, two)
     np.testing.assert_allclose(mapped, [value(axes, x) for x in two], rtol=1e-12)

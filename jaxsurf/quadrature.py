@@ -36,7 +36,7 @@ _BATCH = 128
 _STEPS = 2
 # So many neighbours may bound a cell; where points are very uneven, all are tried.
 _CELLS = 24
-# It has at most so many sides, or half as many as may bound it.
+# Of these it has so many as sides at most, or half of those that are tried.
 _SIDES = 12
 
 

@@ -36,6 +36,8 @@ _BATCH = 128
 _STEPS = 2
 # So many neighbours may bound a cell; where points are very uneven, all are tried.
 _CELLS = 24
+# Of these it has so many as sides at most, or half of those that are tried.
+_SIDES = 12
 
 
 def areas(
@@ -217,12 +219,6 @@ class Sides(eqx.Module):
         flat = jnp.stack([pick(a) for a in self.flat])
         return Sides(flat, pick(self.high), pick(self.offset), jnp.ones_like(which, bool))
 
-    def repeated(self, times: int) -> Sides:
-        """All of them several times."""
-        flat = jnp.concatenate([self.flat] * times, axis=1)
-        rest = (jnp.concatenate([a] * times) for a in (self.high, self.offset, self.on))
-        return Sides(flat, *rest)
-
     def miss(self, graph: Graph, q):
         """How far the points of the surface over q are beyond them, and the slope of that."""
         z, slope = graph.at(q)
@@ -232,8 +228,7 @@ class Sides(eqx.Module):
 
 def _moments(sides: Sides, graph: Graph, ends, measure, which):
     r"""$\int q^\gamma\,dA$ over a cell for all monomials up to the degree."""
-    degree, nodes = graph.degree, _nodes(graph)
-    sides = sides.repeated(nodes) if which is None else sides.chosen(which)
+    degree, nodes, sides = graph.degree, _nodes(graph), sides.chosen(which)
 
     def newton(length, sides, graph, ends):
         beyond, slope = sides.miss(graph, length * ends)
@@ -266,51 +261,71 @@ def _ways(sides: Sides, graph: Graph):
     """Some ways from the point to each side of its cell.
 
     Returns:
-        Their ends if the sides were straight, what each stands for, and None, as they come in the
-        order of the sides; and whether the cell is closed.
+        Their ends if the sides were straight, what each stands for, and the numbers of the sides;
+        and whether the cell is closed.
     """
-    flat, offset, on = jax.lax.stop_gradient((sides.flat, sides.offset, sides.on))
-    # Side j is a_j + t c_j with c_j perpendicular to d_j, of which all others cut off a part.
-    squared = jnp.sum(flat**2, axis=0)
-    foot = offset / jnp.where(squared > 0, squared, 1)
-    # The cutting side first, the side that is cut second: sums over other axes than first are slow.
-    dot = flat[0] * flat[0][:, None] + flat[1] * flat[1][:, None]
-    cross = flat[0] * flat[1][:, None] - flat[1] * flat[0][:, None]
-    room = offset[:, None] - foot * dot
-    other = ~np.eye(len(on), dtype=bool).reshape(len(on), len(on), *(1,) * (on.ndim - 1))
-    other = other & on[:, None]
-    at = room / jnp.where(cross == 0, 1, cross)
-    before = jnp.where(other & (cross < 0), at, -jnp.inf)
-    after = jnp.where(other & (cross > 0), at, jnp.inf)
-    none = jnp.any(other & (cross == 0) & (room < 0), axis=0)
-    low, high = jnp.max(before, axis=0), jnp.min(after, axis=0)
-    used = on & (squared > 0) & (low < high) & ~none
-    bounded = jnp.isfinite(low) & jnp.isfinite(high)
+    fixed = jax.lax.stop_gradient(sides)
+    side, following, closed = _round(fixed.flat, fixed.offset, fixed.on)
+    these, those = sides.chosen(side), sides.chosen(following)
 
-    def corner(t, cutter):
-        t = jnp.where(used & bounded, t, 0)
-        q = jnp.stack([foot * flat[0] - t * flat[1], foot * flat[1] + t * flat[0]])
+    def newton(q, these, those, graph):
+        (u, a), (v, b) = these.miss(graph, q), those.miss(graph, q)
+        return q - _meeting(u, v, *jax.lax.stop_gradient((a, b)))
 
-        def newton(q, sides, its, graph):
-            (u, a), (v, b) = sides.miss(graph, q), its.miss(graph, q)
-            a, b = jax.lax.stop_gradient((a, b))
-            size = a[0] * b[1] - a[1] * b[0]
-            size = jnp.where(size == 0, 1, size)
-            return q - jnp.stack([b[1] * u - a[1] * v, a[0] * v - b[0] * u]) / size
-
-        return jnp.where(used & bounded, _root(newton, q, sides, sides.chosen(cutter), graph), 0)
-
-    first = corner(low, jnp.argmax(before, axis=0))
-    last = corner(high, jnp.argmin(after, axis=0))
+    straight = _meeting(these.offset, those.offset, these.flat, those.flat)
+    last = _root(newton, jax.lax.stop_gradient(straight), these, those, graph)
+    first = jnp.roll(last, 1, axis=1)
     turn = first[0] * last[1] - first[1] * last[0]
     # No point beyond the neighbours looked at can have a part of what is nearer to this one.
-    reach = jnp.max(jnp.where(used, jnp.sum(last**2, axis=0), 0), axis=0)
-    farthest = jnp.max(jnp.where(on & (offset > 0), squared, 0), axis=0)
-    closed = jnp.all(~used | bounded, axis=0) & jnp.any(used, axis=0)
-    closed = closed & (4 * reach <= farthest)
+    reach = jnp.max(jnp.sum(last**2, axis=0), axis=0)
+    away = jnp.where(fixed.on & (fixed.offset > 0), jnp.sum(fixed.flat**2, axis=0), 0)
+    closed = closed & (4 * reach <= jnp.max(away, axis=0))
     share, weights = _gauss(_nodes(graph), 0)
     ends = jnp.concatenate([first + x * (last - first) for x in share], axis=1)
-    return (ends, jnp.concatenate([w * turn for w in weights]), None), closed
+    which = jnp.concatenate([side] * len(share))
+    return (ends, jnp.concatenate([w * turn for w in weights]), which), closed
+
+
+def _meeting(u, v, a, b):
+    r"""Where two lines meet, those of $q\cdot a = u$ and of $q\cdot b = v$."""
+    size = a[0] * b[1] - a[1] * b[0]
+    return jnp.stack([b[1] * u - a[1] * v, a[0] * v - b[0] * u]) / jnp.where(size == 0, 1, size)
+
+
+def _round(flat, offset, on):
+    """Once round a cell, counter-clockwise from its nearest side: each side, and what cuts it off.
+
+    Where there are fewer sides than steps, the last of them stand still.
+    """
+    squared = jnp.sum(flat**2, axis=0)
+    on = on & (squared > 0)
+    foot = offset / jnp.where(on, squared, 1)
+    numbers = np.arange(len(on), dtype=np.int32)[:, None]
+
+    def least(a):
+        # `argmin` takes several times as long.
+        low = jnp.min(a, axis=0)
+        return jnp.min(jnp.where(a == low, numbers, len(a) - 1), axis=0), low < jnp.inf
+
+    def advance(state):
+        side, following, found = state
+        side = jnp.where(following == start, side, following)
+        # Side j is f d_j + t c with c perpendicular to d_j, of which all others cut off a part.
+        x, y, f = (jnp.take_along_axis(a, side[None], axis=0)[0] for a in (*flat, foot))
+        cross = x * flat[1] - y * flat[0]
+        cuts = on & (cross > 0) & (numbers != side)
+        room = offset - f * (x * flat[0] + y * flat[1])
+        following, cut = least(jnp.where(cuts, room / jnp.where(cuts, cross, 1), jnp.inf))
+        return side, following, found & cut
+
+    def step(state, first):
+        state = jax.lax.cond(first | jnp.any(state[1] != start), advance, lambda s: s, state)
+        return state, state[:2]
+
+    start, found = least(jnp.where(on, foot * offset, jnp.inf))
+    firsts = np.arange(max(_SIDES, len(on) // 2)) == 0
+    state, (side, following) = jax.lax.scan(step, (start, start, found), firsts)
+    return side, following, state[2] & (state[1] == start)
 
 
 def _ways_of_curve(sides: Sides):

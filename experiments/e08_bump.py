@@ -168,7 +168,7 @@ def ghosts(name, cloud, method, support) -> Discretisation:
 
 def one_sided(name: str, cloud: js.PointCloud) -> Discretisation:
     """Our most accurate stencils; at the border one-sided ones of the same kind."""
-    closure = js.close(cloud, js.neumann(cloud.boundary), method=_BEST)
+    closure = js.eliminate(cloud, js.neumann(cloud.boundary), method=_BEST)
     neighbors = js.choose_neighbors(cloud, method=_BEST, bound=closure.bound)
     laplacian = js.laplace_beltrami(cloud, neighbors, method=_BEST)
     return Discretisation(f"{name}, {method_name(_BEST)}", cloud, laplacian, closure)

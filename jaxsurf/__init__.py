@@ -4,13 +4,13 @@ Points, then neighbours, then stencils, then operators: `import jaxsurf as js`.
 """
 
 from .borders.border import Border as Border
-from .borders.detect import detect_border as detect_border
+from .borders.detect import detect_boundary as detect_boundary
 from .borders.order import border_conormals as border_conormals
 from .borders.order import find_border as find_border
 from .boundary import Closure as Closure
 from .build import choose_neighbors as choose_neighbors
 from .cells import SearchCapacity as SearchCapacity
-from .cells import allocate as allocate
+from .cells import allocate_search as allocate_search
 from .cells import search_neighbors as search_neighbors
 from .cloud import PointCloud as PointCloud
 from .conditions import Condition as Condition
@@ -36,7 +36,7 @@ from .neighbors import find_neighbors as find_neighbors
 from .normals import estimate_normals as estimate_normals
 from .normals import from_points as from_points
 from .normals import refit_normals as refit_normals
-from .onesided import close as close
+from .onesided import eliminate as eliminate
 from .operators import biharmonic as biharmonic
 from .operators import diffusion as diffusion
 from .operators import directional_derivative as directional_derivative
@@ -65,14 +65,14 @@ from .shapes.resampling import sample_mesh as sample_mesh
 from .shapes.sampling import jitter as jitter
 from .shapes.thinning import poisson_disk as poisson_disk
 from .solve.conserve import conservative_weights as conservative_weights
-from .solve.eigen import Eigenmodes as Eigenmodes
+from .solve.eigen import Modes as Modes
 from .solve.eigen import eigenmodes as eigenmodes
 from .solve.geodesic import geodesic_distance as geodesic_distance
 from .solve.krylov import BiCGStab as BiCGStab
 from .solve.newton import solve_nonlinear as solve_nonlinear
 from .solve.precondition import AbstractPreconditioner as AbstractPreconditioner
-from .solve.precondition import Jacobi as Jacobi
-from .solve.precondition import Multigrid as Multigrid
+from .solve.precondition import JacobiPreconditioner as JacobiPreconditioner
+from .solve.precondition import VCycle as VCycle
 from .solve.precondition import jacobi as jacobi
 from .solve.precondition import multigrid as multigrid
 from .solve.steady import solve as solve
@@ -104,7 +104,7 @@ from .time.preconditioned import step_preconditioner as step_preconditioner
 from .time.problem import AbstractEvolution as AbstractEvolution
 from .time.run import choose_solver as choose_solver
 from .time.stabilize import hyperviscosity as hyperviscosity
-from .time.stabilize import upwinding as upwinding
+from .time.stabilize import upwind_viscosity as upwind_viscosity
 from .time.transport import AdvectionDiffusionReaction as AdvectionDiffusionReaction
 
 __version__ = "0.1.0"

@@ -71,7 +71,7 @@ class Closure(eqx.Module):
 
     Example:
         >>> cloud = js.graph(lambda x, y: 0 * x, (8, 8))
-        >>> closure = js.close(cloud, js.dirichlet(cloud.boundary, 3.0))
+        >>> closure = js.eliminate(cloud, js.dirichlet(cloud.boundary, 3.0))
         >>> u = closure(jnp.zeros(64))
         >>> bool(jnp.all(u[cloud.boundary] == 3)), float(u[~cloud.boundary].max())
         (True, 0.0)
@@ -297,8 +297,8 @@ def check_border(operator: AbstractOperator, conditions: Closure | None) -> None
     raise_at(
         left,
         "point {i}{more} lies on the border and is under no condition, so that modes may grow "
-        "there without bound. Close the border, conditions=js.close(cloud, [js.neumann(...), "
-        "...]), or say that it is free: js.close(cloud, js.free(cloud.boundary))",
+        "there without bound. Close the border, conditions=js.eliminate(cloud, [js.neumann(...), "
+        "...]), or say that it is free: js.eliminate(cloud, js.free(cloud.boundary))",
     )
 
 

@@ -31,7 +31,7 @@ class SearchCapacity(NamedTuple):
 
     Example:
         >>> cloud = js.sphere(300)
-        >>> capacity = js.allocate(cloud.points, 0.5)
+        >>> capacity = js.allocate_search(cloud.points, 0.5)
         >>> neighbors, report = js.search_neighbors(cloud.points, radius=0.5, capacity=capacity)
         >>> neighbors.k == capacity.k, bool(report.overflow)
         (True, False)
@@ -88,7 +88,7 @@ class SearchReport(eqx.Module):
             )
 
 
-def allocate(
+def allocate_search(
     points: Float[Array, "n d"],
     radius: float,
     *,
@@ -113,11 +113,11 @@ def allocate(
 
     Example:
         >>> x = jnp.stack([jnp.arange(10.0), jnp.zeros(10)], axis=1)
-        >>> js.allocate(x, 2.5, margin=1)
+        >>> js.allocate_search(x, 2.5, margin=1)
         SearchCapacity(k=5, candidates=8)
     """
     if not is_concrete(points, active):
-        raise ValueError("allocate needs concrete points: call it outside jit")
+        raise ValueError("allocate_search needs concrete points: call it outside jit")
     points = _checked_points(points, active)
     real(radius, "radius", above=0)
     real(margin, "margin", least=1)
@@ -152,7 +152,7 @@ def search_neighbors(
     Args:
         points: `(n, d)`, d = 2 or 3.
         radius: neighbours are at most this far away; one number, may be traced.
-        capacity: array sizes, from `allocate`.
+        capacity: array sizes, from `allocate_search`.
         k: take only the k nearest of those within the radius.
         normals: `(n, d)`; if given, neighbours have $n_i\cdot n_j \ge$ `min_cosine`.
         active: False for rows that are switched off, `(n,)`.
@@ -173,12 +173,13 @@ def search_neighbors(
 
     Example:
         >>> x = jnp.stack([jnp.arange(10.0), jnp.zeros(10)], axis=1)
-        >>> neighbors, report = js.search_neighbors(x, radius=2.5, capacity=js.allocate(x, 2.5))
+        >>> capacity = js.allocate_search(x, 2.5)
+        >>> neighbors, report = js.search_neighbors(x, radius=2.5, capacity=capacity)
         >>> neighbors.indices[4, :5].tolist(), int(report.k_needed)
         ([4, 3, 5, 2, 6], 5)
     """
     points = _checked_points(points, active)
-    instance(capacity, SearchCapacity, "capacity", "see allocate")
+    instance(capacity, SearchCapacity, "capacity", "see allocate_search")
     if normals is not None:
         normals = as_float(normals, "normals")
         if normals.shape != points.shape:

@@ -133,7 +133,7 @@ def dirichlet(where: Where, value: Value = 0.0) -> Condition:
             `(m, c)` for fields of c components, or a function of time that returns such.
 
     Returns:
-        The condition, for `close`.
+        The condition, for `eliminate`.
 
     Differentiable: in the value.
     Raises:
@@ -158,7 +158,7 @@ def neumann(
             `(m, d)`; those of the border if None.
 
     Returns:
-        The condition, for `close` and `with_ghosts`.
+        The condition, for `eliminate` and `with_ghosts`.
 
     Differentiable: in value and conormals.
     Raises:
@@ -189,7 +189,7 @@ def robin(
         conormals: as in `neumann`.
 
     Returns:
-        The condition, for `close` and `with_ghosts`.
+        The condition, for `eliminate` and `with_ghosts`.
 
     Differentiable: in value, a, b and conormals.
     Raises:
@@ -213,14 +213,14 @@ def free(where: Where) -> Condition:
         where: mask `(n,)` or indices `(m,)`, concrete.
 
     Returns:
-        The condition, for `close` and `with_ghosts`.
+        The condition, for `eliminate` and `with_ghosts`.
 
     Raises:
         ValueError: a point named twice.
 
     Example:
         >>> square = js.graph(lambda x, y: 0.0 * x, (7, 7))
-        >>> js.close(square, js.free(square.boundary)).m
+        >>> js.eliminate(square, js.free(square.boundary)).m
         0
     """
     return Condition(where, 0.0, a=None, b=None)

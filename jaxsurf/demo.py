@@ -27,7 +27,7 @@ from .formats.by_suffix import contents_of
 from .heat import Heat, cell_areas, diffuse, spot
 from .io import read, write
 from .neighbors import Neighbors
-from .onesided import close
+from .onesided import eliminate
 from .operators import laplace_beltrami
 from .plot import plot_fields
 from .shapes.implicit import level_set_normals, project_to_level_set
@@ -298,7 +298,7 @@ def _held_at_border(cloud: PointCloud) -> Closure | None:
     border = cloud.boundary
     if border is None or not border.any():
         return None
-    return close(cloud, dirichlet(border, jnp.zeros(int(border.sum()), cloud.points.dtype)))
+    return eliminate(cloud, dirichlet(border, jnp.zeros(int(border.sum()), cloud.points.dtype)))
 
 
 def _at_rest_on_border(laplacian: Stencil) -> Stencil:

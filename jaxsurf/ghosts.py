@@ -52,7 +52,7 @@ def with_ghosts(
 
     Args:
         cloud: n points with `boundary`, concrete.
-        conditions: as for `close`; points off the border take Dirichlet conditions only. Parts
+        conditions: as for `eliminate`; points off the border take Dirichlet conditions only. Parts
             of the border under no condition get no images.
         method: of the operators to come: its neighbourhoods decide how deep the images reach.
         depth: how deep, in the units of the points; by the method if None.
@@ -69,9 +69,9 @@ def with_ghosts(
     to the method's order only where the solution itself has the symmetry.
     Differentiable: in values, a and b; not in the points, whose images are found on the host.
     Raises:
-        ValueError: as `close` and `find_border`; a Neumann or Robin condition off the border; no
-            border point under any condition; b/s + a near zero (a Robin condition of the wrong
-            sign), with the point.
+        ValueError: as `eliminate` and `find_border`; a Neumann or Robin condition off the border;
+            no border point under any condition; b/s + a near zero (a Robin condition of the
+            wrong sign), with the point.
     Source: the method of images of Singh et al. 2023, Section 4.5.
 
     Example:

@@ -22,7 +22,7 @@ from .stencils.method import AbstractMethod
 from .stencils.targets import Gradient
 
 
-def close(
+def eliminate(
     cloud: PointCloud,
     conditions: Condition | Sequence[Condition],
     *,
@@ -68,7 +68,7 @@ def close(
     Example:
         >>> cloud = js.sphere(500)
         >>> equator = jnp.abs(cloud.points[:, 2]) < 0.05
-        >>> closure = js.close(cloud, js.dirichlet(equator, 2.0))
+        >>> closure = js.eliminate(cloud, js.dirichlet(equator, 2.0))
         >>> bool((closure(jnp.zeros(500)) == jnp.where(equator, 2.0, 0.0)).all())
         True
     """

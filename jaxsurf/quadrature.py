@@ -36,8 +36,8 @@ _BATCH = 128
 _STEPS = 2
 # So many neighbours may bound a cell; where points are very uneven, all are tried.
 _CELLS = 24
-# Of these it has so many as sides at most, or half of those that are tried.
-_SIDES = 12
+# Of these so many are its sides at most, or half of those that are tried.
+_SIDES = 16
 
 
 def areas(

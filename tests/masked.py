@@ -239,7 +239,7 @@ def modes(c: Case, k=5, **options):
 
 def searched(c: Case):
     points = c.cloud.points
-    capacity = js.allocate(points, 0.8, active=c.cloud.active)
+    capacity = js.allocate_search(points, 0.8, active=c.cloud.active)
     options = dict(radius=0.8, capacity=capacity, normals=c.cloud.normals, active=c.cloud.active)
     neighbors, report = js.search_neighbors(points, **options)
     return listed(c, neighbors), np.array([capacity.k, report.k_needed], float)
@@ -375,7 +375,7 @@ def preconditioned(c: Case, make):
 # With a border.
 
 
-def bounded(c: Case, kind=js.close):
+def bounded(c: Case, kind=js.eliminate):
     border = c.cloud.boundary & c.cloud.host_active
     x = np.asarray(c.cloud.points)[np.asarray(border)]
     half = x[:, 0] > 0
@@ -386,7 +386,7 @@ def bounded(c: Case, kind=js.close):
 
 
 def closed(c: Case):
-    closure = js.close(c.cloud, bounded(c), neighbors=None, method=METHOD)
+    closure = js.eliminate(c.cloud, bounded(c), neighbors=None, method=METHOD)
     u = jnp.where(jnp.isnan(c.u), 0, c.u)
     return {
         "values": closure(c.u)[c.rows],
@@ -426,7 +426,7 @@ def marked(c: Case):
     return {
         "order": place[np.asarray(border.points)].astype(float),
         "conormals": js.border_conormals(c.cloud),
-        "detected": np.asarray(js.detect_border(c.cloud), float),
+        "detected": np.asarray(js.detect_boundary(c.cloud), float),
     }
 
 
@@ -486,7 +486,9 @@ TABLE = {
     ),
     "spectral_estimate": Row(estimated, SOLVED, core=True),
     "hyperviscosity": Row(lambda c: js.hyperviscosity(c.laplacian, 1.0)(c.u), SOLVED),
-    "upwinding": Row(lambda c: js.upwinding(c.cloud, velocity(c), method=METHOD)(c.u)),
+    "upwind_viscosity": Row(
+        lambda c: js.upwind_viscosity(c.cloud, velocity(c), method=METHOD)(c.u)
+    ),
     "refit_normals": Row(refitted),
     "sort_cloud": Row(ordered, core=True),
     "jitter": Row(jittered),
@@ -515,7 +517,7 @@ TABLE = {
     "step_preconditioner": Row(stepped, SINGLE),
     "Checkpoint": Row(parted, LOOSE),
     "steady_state": Row(stilled, LOOSE),
-    "close": Row(closed, SOLVED, open=True),
+    "eliminate": Row(closed, SOLVED, open=True),
     "with_ghosts": Row(mirrored, SOLVED, open=True),
     "find_border": Row(marked, open=True),
     "Discretization": Row(shore, open=True),
@@ -523,11 +525,12 @@ TABLE = {
 
 # Tried with those of the table that they are named beside.
 BESIDE = {
-    "allocate": "search_neighbors", "SearchCapacity": "search_neighbors",
-    "border_conormals": "find_border", "detect_border": "find_border", "Border": "find_border",
-    "Closure": "close", "Condition": "close", "dirichlet": "close", "robin": "close",
-    "neumann": "with_ghosts", "Multigrid": "multigrid", "Jacobi": "jacobi",
-    "BiCGStab": "solve", "Eigenmodes": "eigenmodes", "Spectrum": "spectral_estimate",
+    "allocate_search": "search_neighbors", "SearchCapacity": "search_neighbors",
+    "border_conormals": "find_border", "detect_boundary": "find_border", "Border": "find_border",
+    "Closure": "eliminate", "Condition": "eliminate", "dirichlet": "eliminate",
+    "robin": "eliminate", "neumann": "with_ghosts", "VCycle": "multigrid",
+    "JacobiPreconditioner": "jacobi",
+    "BiCGStab": "solve", "Modes": "eigenmodes", "Spectrum": "spectral_estimate",
     "plot_fields": "plot_cloud", "read": "write", "read_fields": "write",
     "GFDM": "surface_gradient", "RBFFD": "surface_gradient",
     "DCPSE": "laplace_beltrami", "Diagnostics": "laplace_beltrami",

@@ -104,7 +104,7 @@ def laplacian_of(cloud, bound, method):
 
 
 def one_sided(cloud, conditions, method, closing=None):
-    closure = js.close(cloud, conditions, method=closing or method)
+    closure = js.eliminate(cloud, conditions, method=closing or method)
     return laplacian_of(cloud, closure.bound, method), closure
 
 
@@ -125,7 +125,7 @@ def test_bound_values_of_polynomials_are_exact():
     gradient = jnp.stack([6 * x - y + 1, 4 * y - x, 0 * x], axis=1)
     for kind in ("dirichlet", "neumann", "robin"):
         for method in (js.GFDM(degree=2), js.DCPSE(order=2)):
-            closure = js.close(cloud, condition(kind, cloud, u, gradient), method=method)
+            closure = js.eliminate(cloud, condition(kind, cloud, u, gradient), method=method)
             wrong = jnp.where(cloud.boundary, jnp.nan, u)  # bound values are not looked at
             np.testing.assert_allclose(closure(wrong), u, atol=1e-10)
 
@@ -137,7 +137,7 @@ def test_the_parts_of_a_closure_agree():
     left = np.abs(x[:, 0] + 1) < 1e-9
     rest = np.asarray(cloud.boundary) & ~left
     inner = [int(np.argmin(np.abs(x).sum(axis=1)))]
-    closure = js.close(
+    closure = js.eliminate(
         cloud,
         [
             js.dirichlet(left, lambda t: jnp.sin(t)),
@@ -172,7 +172,7 @@ def test_values_per_component():
     value = jnp.array([[1.0, 2.0]])
     border = jnp.flatnonzero(cloud.boundary)
     values = jnp.tile(value, (len(border), 1))
-    closure = js.close(cloud, js.dirichlet(border, values))
+    closure = js.eliminate(cloud, js.dirichlet(border, values))
     filled = closure(jnp.zeros((cloud.n, 2)))
     np.testing.assert_array_equal(filled[border], values)
     with pytest.raises(ValueError, match="the field has none"):
@@ -185,7 +185,7 @@ def test_points_that_are_declared_free():
     border = np.asarray(cloud.boundary)
     left = np.asarray(cloud.points[:, 0]) < -1 + 1e-9
     u = jnp.asarray(np.random.default_rng(0).normal(size=cloud.n))
-    nothing = js.close(cloud, js.free(border))
+    nothing = js.eliminate(cloud, js.free(border))
     assert nothing.m == 0 and not nothing.bound.any()
     np.testing.assert_array_equal(nothing.declared, border)
     for filled in (nothing(u), nothing.homogeneous(u), nothing.restrict(u), nothing.extension(u)):
@@ -194,13 +194,13 @@ def test_points_that_are_declared_free():
     np.testing.assert_array_equal(nothing.offset(), 0 * u)
     assert (nothing.to_scipy() != scipy.sparse.identity(cloud.n)).nnz == 0
     # Some bound, the others free: those that are bound are bound as without the others.
-    alone = js.close(cloud, js.dirichlet(left, 2.0))
-    both = js.close(cloud, [js.free(border & ~left), js.dirichlet(left, 2.0)])
+    alone = js.eliminate(cloud, js.dirichlet(left, 2.0))
+    both = js.eliminate(cloud, [js.free(border & ~left), js.dirichlet(left, 2.0)])
     np.testing.assert_array_equal(both(u), alone(u))
     np.testing.assert_array_equal(both.declared, border)
     np.testing.assert_array_equal(alone.declared, left)
     with pytest.raises(ValueError, match="do not agree"):
-        js.close(cloud, [js.free(border), js.dirichlet(left)])
+        js.eliminate(cloud, [js.free(border), js.dirichlet(left)])
 
 
 @pytest.mark.core
@@ -210,7 +210,7 @@ def test_points_that_are_declared_free_under_transformations():
     u = jnp.asarray(np.random.default_rng(0).normal(size=(2, cloud.n)))
 
     def filled(u):
-        return js.close(cloud, js.free(np.asarray(cloud.boundary)))(u)
+        return js.eliminate(cloud, js.free(np.asarray(cloud.boundary)))(u)
 
     np.testing.assert_array_equal(jax.jit(jax.vmap(filled))(u), u)
     slope = jax.grad(lambda u: jnp.vdot(jnp.sin(u), filled(u)))(u[0])
@@ -262,15 +262,17 @@ def test_a_border_about_which_nothing_is_said():
     words = rf"point {left[0]} \(and {len(left) - 1} more\) lies on the border .*js.free\("
     for operator in operators:
         np.testing.assert_array_equal(operator.border, border)
-        check_border(operator, js.close(cloud, js.free(border)))
-        check_border(operator, js.close(cloud, js.neumann(border)))
+        check_border(operator, js.eliminate(cloud, js.free(border)))
+        check_border(operator, js.eliminate(cloud, js.neumann(border)))
         with pytest.raises(ValueError, match=rf"point 0 \(and {border.sum() - 1} more\) lies on"):
             check_border(operator, None)
         with pytest.raises(ValueError, match=words):
-            check_border(operator, js.close(cloud, js.dirichlet(np.flatnonzero(border)[:3])))
+            check_border(operator, js.eliminate(cloud, js.dirichlet(np.flatnonzero(border)[:3])))
     with pytest.raises(ValueError, match="conditions of 81 points, the operator has 49"):
         small = square(7)
-        check_border(js.laplace_beltrami(small, method=method), js.close(cloud, js.free(border)))
+        check_border(
+            js.laplace_beltrami(small, method=method), js.eliminate(cloud, js.free(border))
+        )
     # Nothing to say of closed surfaces, of bare stencils, of points that are switched off, and of
     # traced borders.
     check_border(js.Stencil(laplacian.indices, laplacian.weights), None)
@@ -296,11 +298,11 @@ def test_great_circle_and_single_points():
     cloud = js.sphere(800)
     circle = jnp.abs(cloud.points[:, 0]) < 0.04
     u, _, lap = field(cloud, 1.0)
-    closure = js.close(cloud, js.dirichlet(circle, u[circle]))
+    closure = js.eliminate(cloud, js.dirichlet(circle, u[circle]))
     laplacian = js.laplace_beltrami(cloud, method=js.GFDM(degree=4))
     error = poisson_error(cloud, laplacian, closure, u, lap, 0.0)
     assert error < 3e-4
-    closure = js.close(cloud, js.dirichlet([5], u[5:6]))
+    closure = js.eliminate(cloud, js.dirichlet([5], u[5:6]))
     error = poisson_error(cloud, laplacian, closure, u, lap, 0.0)
     assert error < 1e-3
 
@@ -313,7 +315,7 @@ def test_ends_of_a_curve():
         cloud = js.PointCloud(points, side * points, boundary=border)
         exact = jnp.array([[jnp.sin(0.2), -jnp.cos(0.2)], [-jnp.sin(2.0), jnp.cos(2.0)]])
         np.testing.assert_allclose(js.border_conormals(cloud), exact, atol=1e-14)
-        np.testing.assert_array_equal(js.detect_border(cloud), border)
+        np.testing.assert_array_equal(js.detect_boundary(cloud), border)
         conditions = js.neumann(border, jnp.array([jnp.sin(0.4), -jnp.sin(4.0)]) * 2)
         laplacian, closure = one_sided(cloud, conditions, js.GFDM(degree=4))
         u = jnp.cos(2 * angle)
@@ -462,7 +464,7 @@ def closed_field(points, normals, value, a, b, conormals, u):
     where = np.asarray(SMALL.boundary)
     given = js.robin(where, value, a=a, b=b, conormals=conormals)
     found = js.robin(where, value, a=a, b=b)
-    closures = [js.close(cloud, c, neighbors=NEAR, border=BORDER) for c in (given, found)]
+    closures = [js.eliminate(cloud, c, neighbors=NEAR, border=BORDER) for c in (given, found)]
     return jnp.stack([closure(u) for closure in closures])
 
 
@@ -510,7 +512,7 @@ def test_closures_and_conormals_under_vmap():
         normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
         cloud = js.PointCloud(moved, normals)
         condition = js.robin(np.asarray(SMALL.boundary), s + FLUX, a=1.0 + s, b=1.0)
-        closure = js.close(cloud, condition, neighbors=NEAR, border=BORDER)
+        closure = js.eliminate(cloud, condition, neighbors=NEAR, border=BORDER)
         return closure(U * (1 + s)), js.border_conormals(cloud, BORDER)
 
     together = jax.jit(jax.vmap(filled))(shifts)
@@ -542,16 +544,16 @@ def test_single_precision():
         boundary=SMALL.boundary,
     )
     border = js.find_border(single)
-    np.testing.assert_array_equal(js.detect_border(single), js.detect_border(SMALL))
+    np.testing.assert_array_equal(js.detect_boundary(single), js.detect_boundary(SMALL))
     nu = js.border_conormals(single)
     assert nu.dtype == jnp.float32
     np.testing.assert_allclose(nu, js.border_conormals(SMALL), atol=1e-5)
     where = np.asarray(SMALL.boundary)
     conditions = js.robin(where, FLUX, a=0.5, b=1.0)
-    closure = js.close(single, conditions)
+    closure = js.eliminate(single, conditions)
     filled = closure(U.astype(jnp.float32))
     assert filled.dtype == closure.weights.dtype == closure.offset().dtype == jnp.float32
-    np.testing.assert_allclose(filled, js.close(SMALL, conditions)(U), atol=2e-5)
+    np.testing.assert_allclose(filled, js.eliminate(SMALL, conditions)(U), atol=2e-5)
     wide, images = js.with_ghosts(single, conditions)
     exact_cloud, exact = js.with_ghosts(SMALL, conditions)
     assert wide.points.dtype == images.weights.dtype == jnp.float32
@@ -570,11 +572,11 @@ def test_new_numbers_compile_nothing():
         cloud = js.PointCloud(points, SMALL.normals, boundary=SMALL.boundary)
         where = np.asarray(SMALL.boundary)
         border = js.find_border(cloud)
-        js.detect_border(cloud)
+        js.detect_boundary(cloud)
         js.border_conormals(cloud, border)
         filled = []
         for g in (value, lambda t: value * jnp.cos(t)):
-            closure = js.close(cloud, js.robin(where, g, a=a, b=1.0), border=border)
+            closure = js.eliminate(cloud, js.robin(where, g, a=a, b=1.0), border=border)
             filled.append(closure(U, 0.3))
         _, closure = js.with_ghosts(cloud, js.robin(where, value, a=a, b=1.0), border=border)
         return [*filled, closure.extend(U)]
@@ -598,7 +600,7 @@ def test_borders_do_not_hang_on_the_last_bit():
         again = js.find_border(near)
         for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
             np.testing.assert_array_equal(a, b)
-        np.testing.assert_array_equal(js.detect_border(near), js.detect_border(cloud))
+        np.testing.assert_array_equal(js.detect_boundary(near), js.detect_boundary(cloud))
         wide_again, closure_again = js.with_ghosts(near, js.neumann(where))
         np.testing.assert_allclose(wide_again.points, wide.points, atol=1e-12)
         np.testing.assert_array_equal(closure_again.indices, closure.indices)
@@ -606,7 +608,7 @@ def test_borders_do_not_hang_on_the_last_bit():
 
 def test_what_borders_and_closures_say_of_themselves():
     where = np.asarray(SMALL.boundary)
-    closure = js.close(SMALL, [js.dirichlet([40], 2.0), js.free(where)])
+    closure = js.eliminate(SMALL, [js.dirichlet([40], 2.0), js.free(where)])
     assert repr(closure) == (
         "Closure(1 of 81 points bound: dirichlet(1 points, value=2), free(32 points))"
     )
@@ -644,8 +646,8 @@ def test_conormals():
 @pytest.mark.parametrize("make", [lambda: square(17, 0.35), lambda: cap(700), lambda: annulus(900)])
 def test_borders_are_detected(make):
     cloud = make()
-    np.testing.assert_array_equal(js.detect_border(cloud), cloud.boundary)
-    assert not js.detect_border(js.sphere(700)).any()
+    np.testing.assert_array_equal(js.detect_boundary(cloud), cloud.boundary)
+    assert not js.detect_boundary(js.sphere(700)).any()
 
 
 @pytest.mark.core
@@ -712,11 +714,11 @@ def test_bad_conditions():
     ]
     for conditions, message in bad:
         if message is None:
-            js.close(cloud, conditions)
+            js.eliminate(cloud, conditions)
             continue
         with pytest.raises(ValueError, match=message):
-            js.close(cloud, conditions)
-    same = js.close(cloud, [js.dirichlet(border, 1.0), js.dirichlet(border[3:], 1.0)])
+            js.eliminate(cloud, conditions)
+    same = js.eliminate(cloud, [js.dirichlet(border, 1.0), js.dirichlet(border[3:], 1.0)])
     assert same.m == len(border)
     with pytest.raises(ValueError, match="where names point 3 2 times"):
         js.dirichlet([3, 3])
@@ -728,18 +730,18 @@ def test_bad_conditions():
         js.find_border(js.sphere(50))
     off = js.PointCloud(cloud.points, cloud.normals, active=jnp.arange(81) != border[0])
     with pytest.raises(ValueError, match=f"names point {border[0]}, which is switched off"):
-        js.close(off, js.dirichlet(border))
+        js.eliminate(off, js.dirichlet(border))
 
 
 def test_a_robin_condition_of_the_wrong_sign():
     cloud = square(9)
     near = js.find_neighbors(cloud, k=40)
     border = js.find_border(cloud)
-    closure = js.close(cloud, js.neumann(cloud.boundary), neighbors=near, border=border)
+    closure = js.eliminate(cloud, js.neumann(cloud.boundary), neighbors=near, border=border)
     pivot = 1 / closure.sources[0].factor  # w_i, as a = 0 and b = 1
     conditions = js.robin(cloud.boundary, a=-pivot, b=1.0)
     with pytest.raises(ValueError, match=r"does not determine the value at point \d+: a \+ b w_i"):
-        js.close(cloud, conditions, neighbors=near)
+        js.eliminate(cloud, conditions, neighbors=near)
 
 
 def test_too_few_free_neighbours():
@@ -747,7 +749,7 @@ def test_too_few_free_neighbours():
     near = js.find_neighbors(cloud, k=8)
     message = r"point \d+ has \d free neighbours, GFDM.* needs at least 5 besides the point itself"
     with pytest.raises(ValueError, match=message):
-        js.close(cloud, js.neumann(cloud.boundary), neighbors=near)
+        js.eliminate(cloud, js.neumann(cloud.boundary), neighbors=near)
 
 
 def test_bad_ghosts():

@@ -84,7 +84,7 @@ def test_dirichlet_conditions():
     points = jnp.concatenate([cloud.points[keep], ring])
     bound = jnp.arange(len(points)) >= len(points) - 200
     cloud = js.PointCloud(points, points, boundary=bound)
-    conditions = js.close(cloud, [js.dirichlet(bound)])
+    conditions = js.eliminate(cloud, [js.dirichlet(bound)])
     modes = js.eigenmodes(js.laplace_beltrami(cloud), 6, conditions=conditions)
     np.testing.assert_allclose(modes.values, [2, 6, 6, 12, 12, 12], rtol=2e-2)
     assert jnp.abs(modes.functions[bound]).max() == 0
@@ -176,7 +176,7 @@ def test_exactly_equal_values():
 def test_derivative_in_the_conditions():
     cloud = js.graph(lambda x, y: 0.2 * x * y, (16, 18))
     operator = js.laplace_beltrami(cloud, method=js.GFDM(degree=2))
-    closure = js.close(cloud, [js.robin(cloud.boundary, 0.0, a=1.0, b=0.5)])
+    closure = js.eliminate(cloud, [js.robin(cloud.boundary, 0.0, a=1.0, b=0.5)])
 
     def value(weights):
         conditions = eqx.tree_at(lambda c: c.weights, closure, weights)

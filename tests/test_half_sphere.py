@@ -48,14 +48,14 @@ def asked(half, conditions):
     ["solve", "solve_nonlinear", "eigenmodes", "heat", "transport", "transport in time"],
 )
 def test_nothing_is_said_about_the_border(half, name):
-    with pytest.raises(ValueError, match=r"under no condition.*js\.close.*js\.free"):
+    with pytest.raises(ValueError, match=r"under no condition.*js\.eliminate.*js\.free"):
         asked(half, None)[name]()
 
 
 def test_no_flux(half):
     """Of the harmonics of the sphere those that are even in z are left."""
     cloud, laplacian = half
-    closed = js.close(cloud, js.neumann(cloud.boundary))
+    closed = js.eliminate(cloud, js.neumann(cloud.boundary))
     values = np.asarray(js.eigenmodes(laplacian, 3, conditions=closed).values)
     np.testing.assert_allclose(values, [0, 2, 2], atol=0.02)
     x = cloud.points[:, 0]
@@ -69,7 +69,7 @@ def test_no_flux(half):
 def test_a_border_that_is_free(half):
     """What is said to be free is taken as it is: nothing is bound, and the solution is there."""
     cloud, laplacian = half
-    free = js.close(cloud, js.free(cloud.boundary))
+    free = js.eliminate(cloud, js.free(cloud.boundary))
     z = cloud.points[:, 2]
     found = js.solve(1 - laplacian, 3 * z, conditions=free)
     assert float(found.stats["relative_residual"]) < 1e-7

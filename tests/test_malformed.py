@@ -13,7 +13,7 @@ from . import malformed
 
 # What functions return or raise, and classes to be filled out by users.
 MADE_FOR_USERS = (
-    {"Diagnostics", "Eigenmodes", "IntegrationError", "Jacobi", "Multigrid"}
+    {"Diagnostics", "Modes", "IntegrationError", "JacobiPreconditioner", "VCycle"}
     | {"SearchCapacity", "Spectrum"}
     | {name for name in vars(js) if name.startswith("Abstract")}
 )

@@ -140,9 +140,9 @@ DERIVED = {
         ),
         False,
     ),
-    "upwinding": (
+    "upwind_viscosity": (
         lambda cloud, lists, u, c: total(
-            js.upwinding(cloud, cloud.points, neighbors=lists, method=METHOD)(u)
+            js.upwind_viscosity(cloud, cloud.points, neighbors=lists, method=METHOD)(u)
         ),
         False,
     ),

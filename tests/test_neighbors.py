@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from jaxsurf.cells import SearchCapacity, allocate, search_neighbors
+from jaxsurf.cells import SearchCapacity, allocate_search, search_neighbors
 from jaxsurf.checks import two_sheets
 from jaxsurf.cloud import PointCloud
 from jaxsurf.curvature import tube_ratio
@@ -127,7 +127,7 @@ def test_switched_off_points():
     rest = find_neighbors(PointCloud(x[active], x[active]), 10)
     names = np.flatnonzero(active)
     assert np.array_equal(indices[active], names[np.asarray(rest.indices)])
-    capacity = allocate(jnp.asarray(points), 0.5, active=jnp.asarray(active))
+    capacity = allocate_search(jnp.asarray(points), 0.5, active=jnp.asarray(active))
     found, _ = search_neighbors(
         jnp.asarray(points), radius=0.5, capacity=capacity, active=jnp.asarray(active)
     )
@@ -158,14 +158,18 @@ def test_both_searches_give_the_same_sets_on_spheres(make, shift):
     x = make(1500)
     points, normals = jnp.asarray(x + shift), jnp.asarray(x)
     radius = 3.2 * spacing(1500)
-    capacity = allocate(points, radius)
+    capacity = allocate_search(points, radius)
     found, report = search_neighbors(points, radius=radius, capacity=capacity, normals=normals)
     host = find_neighbors(PointCloud(points, normals), radius=radius, capacity=capacity.k)
     assert not bool(report.overflow)
     assert np.array_equal(found.indices, host.indices)
     assert np.array_equal(found.mask, host.mask)
     found, _ = search_neighbors(
-        points, radius=2 * radius, capacity=allocate(points, 2 * radius), normals=normals, k=20
+        points,
+        radius=2 * radius,
+        capacity=allocate_search(points, 2 * radius),
+        normals=normals,
+        k=20,
     )
     host = find_neighbors(PointCloud(points, normals), 20)
     assert np.array_equal(found.indices, host.indices)
@@ -178,14 +182,14 @@ def test_both_searches_agree_on_ties_and_thin_parts(gap, dtype):
     # Lattices turned out of the axes: all distances tie, up to round-off.
     x, normals = plates(gap)
     points, normals = jnp.asarray(0.1 * x, dtype), jnp.asarray(normals, dtype)
-    capacity = allocate(points, 0.3)  # exactly three spacings
+    capacity = allocate_search(points, 0.3)  # exactly three spacings
     found, _ = search_neighbors(points, radius=0.3, capacity=capacity, normals=normals)
     host = find_neighbors(PointCloud(points, normals), radius=0.3, capacity=capacity.k)
     assert int(host.mask.sum(axis=1).max()) == 29
     assert np.array_equal(found.indices, host.indices)
     assert np.array_equal(found.mask, host.mask)
     nearest, _ = search_neighbors(
-        points, radius=0.7, capacity=allocate(points, 0.7), normals=normals, k=11
+        points, radius=0.7, capacity=allocate_search(points, 0.7), normals=normals, k=11
     )
     assert np.array_equal(nearest.indices, find_neighbors(PointCloud(points, normals), 11).indices)
 
@@ -193,7 +197,7 @@ def test_both_searches_agree_on_ties_and_thin_parts(gap, dtype):
 def test_both_searches_agree_on_curves():
     angle = 2 * np.pi * np.sort(np.random.default_rng(0).uniform(size=300))
     x = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    capacity = allocate(jnp.asarray(x), 0.2)
+    capacity = allocate_search(jnp.asarray(x), 0.2)
     found, _ = search_neighbors(jnp.asarray(x), radius=0.2, capacity=capacity)
     host = find_neighbors(PointCloud(x, x), radius=0.2, capacity=capacity.k)
     assert np.array_equal(found.indices, host.indices)
@@ -203,7 +207,7 @@ def test_a_stray_point_far_away_changes_nothing():
     x = fibonacci(800)
     stray = jnp.asarray(np.r_[x, [[3e12, -2e12, 1e12]]])
     radius = 3 * spacing(800)
-    capacity = allocate(jnp.asarray(x), radius)
+    capacity = allocate_search(jnp.asarray(x), radius)
     alone, _ = search_neighbors(jnp.asarray(x), radius=radius, capacity=capacity)
     both, report = search_neighbors(stray, radius=radius, capacity=capacity)
     assert np.array_equal(both.indices[:800], alone.indices)
@@ -214,7 +218,7 @@ def test_a_stray_point_far_away_changes_nothing():
 def test_search_under_jit_vmap_and_grad():
     x = jnp.asarray(fibonacci(500))
     radius = 3 * spacing(500)
-    capacity = allocate(x, radius)
+    capacity = allocate_search(x, radius)
     traces = []
 
     @jax.jit
@@ -243,7 +247,7 @@ def test_search_under_jit_vmap_and_grad():
 def test_capacity_exceeded_gives_both_numbers():
     x = jnp.asarray(fibonacci(500))
     radius = 3 * spacing(500)
-    exact = allocate(x, radius, margin=1)
+    exact = allocate_search(x, radius, margin=1)
     _, report = search_neighbors(x, radius=radius, capacity=exact)
     assert int(report.k_needed) == exact.k
     assert int(report.candidates_needed) == exact.candidates
@@ -294,7 +298,7 @@ def test_misuse_is_refused():
     with pytest.raises(ValueError, match="search_neighbors"):
         jax.jit(lambda p: find_neighbors(PointCloud(p, x), 5).indices)(x)
     with pytest.raises(ValueError, match="outside jit"):
-        jax.jit(lambda p: allocate(p, 1.0))(x)
+        jax.jit(lambda p: allocate_search(p, 1.0))(x)
 
 
 def test_lone_points_and_duplicates_are_named():

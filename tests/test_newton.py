@@ -45,7 +45,7 @@ def test_conditions_hold(problem):
     cloud, operator, _ = problem
     z = cloud.points[:, 2]
     cap = z > 0.8
-    conditions = js.close(cloud, js.dirichlet(cap, z[cap]))
+    conditions = js.eliminate(cloud, js.dirichlet(cap, z[cap]))
     rhs = 3 * z + z**3
     found = js.solve_nonlinear(
         operator, lambda u, _: u + u**3, 0 * z, rhs=rhs, conditions=conditions

@@ -109,7 +109,7 @@ def test_jacobi_is_the_diagonal():
     diagonal = operator.to_scipy().diagonal()
     np.testing.assert_allclose(js.jacobi(operator).divisor, diagonal, rtol=1e-12)
     bound = jnp.arange(300) < 10
-    conditions = js.close(cloud, js.dirichlet(bound, 0.0))
+    conditions = js.eliminate(cloud, js.dirichlet(bound, 0.0))
     with_conditions = js.jacobi(operator, conditions=conditions).divisor
     np.testing.assert_allclose(with_conditions, jnp.where(bound, 1, diagonal), rtol=1e-12)
     with pytest.raises(ValueError, match="Composition"):
@@ -119,7 +119,7 @@ def test_jacobi_is_the_diagonal():
 def test_constants_are_recognised():
     cloud = js.sphere(400)
     laplacian = js.laplace_beltrami(cloud)
-    pinned = js.close(cloud, js.dirichlet(np.array([3]), 1.0))
+    pinned = js.eliminate(cloud, js.dirichlet(np.array([3]), 1.0))
 
     def singular(operator, conditions=None):
         matrix = reduced_matrix(operator, conditions)
@@ -140,7 +140,7 @@ def test_separate_parts_are_singular_and_named():
     with pytest.raises(ValueError, match=r"2 parts .* 300 points around point 0"):
         js.multigrid(laplacian)
     # A value on one of them leaves the other.
-    pinned = js.close(two, js.dirichlet(np.array([0]), 0.0))
+    pinned = js.eliminate(two, js.dirichlet(np.array([0]), 0.0))
     with pytest.raises(ValueError, match=r"300 points around point 300"):
         js.multigrid(laplacian, conditions=pinned)
 

@@ -57,7 +57,7 @@ def test_at_the_same_weights_the_numbers_are_those_of_the_host(kind):
     operator = SURFACE.laplacian
     if kind == "masked":
         operator = js.laplace_beltrami(cloud, method=SURFACE.method)
-    conditions = js.close(CLOUD, BAND) if kind == "dirichlet" else None
+    conditions = js.eliminate(CLOUD, BAND) if kind == "dirichlet" else None
     host = js.multigrid(operator, conditions=conditions, renewable=True)
     renewed = host.renewed(operator, conditions=conditions)
     assert renewed.sizes == host.sizes and len(host.levels) == 2
@@ -84,7 +84,7 @@ def test_steps_are_those_of_a_hierarchy_made_anew(method, closed):
     """On a deformed sphere with neighbours found anew; another one compiles nothing."""
     k = method.neighbor_count(3)
     first = js.laplace_beltrami(CLOUD, js.find_neighbors(CLOUD, k=k), method=method)
-    conditions = None if closed else js.close(CLOUD, BAND)
+    conditions = None if closed else js.eliminate(CLOUD, BAND)
     cycle = js.multigrid(first, conditions=conditions, renewable=True)
 
     def steps(preconditioner, operator):
@@ -133,7 +133,7 @@ def test_derivatives_in_points_through_compiled_solves(given):
 @pytest.mark.parametrize("kind", ["closed", "dirichlet", "screened"])
 def test_aggregates_found_by_neighbours_serve_as_well(kind):
     surface = js.discretize(CLOUD, method=js.GFDM(degree=4))
-    conditions = js.close(CLOUD, BAND) if kind == "dirichlet" else None
+    conditions = js.eliminate(CLOUD, BAND) if kind == "dirichlet" else None
     options = {"project": True, "conditions": conditions, "mean_zero": kind == "closed"}
 
     def solution(t):
@@ -178,7 +178,7 @@ def test_sums_and_compositions():
 @pytest.mark.parametrize("closed", [True, False])
 def test_hierarchies_for_all_steps(closed):
     laplacian = SURFACE.laplacian
-    conditions = None if closed else js.close(CLOUD, BAND)
+    conditions = None if closed else js.eliminate(CLOUD, BAND)
     host = shifted.shifted_multigrid(laplacian, conditions=conditions, renewable=True)
     renewed = host.renewed(laplacian, conditions=conditions)
     assert len(host.pairs) == 2

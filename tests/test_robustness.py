@@ -76,7 +76,7 @@ class Problem:
         """Values are given in a cap, or along a side of the square."""
         at = self.cloud.points[:, 0] > 0.85 * float(self.cloud.points[:, 0].max())
         value = smooth(self.cloud.points)[at]
-        return js.close(self.cloud, [js.dirichlet(at, value)], **self.given)
+        return js.eliminate(self.cloud, [js.dirichlet(at, value)], **self.given)
 
 
 @functools.cache
@@ -148,8 +148,8 @@ POINTWISE = {
         [EVEN, *UNEVEN],
         1e-11,
     ),
-    "detect_border": (lambda p: js.detect_border(p.cloud).astype(float), UNEVEN, 0),
-    "close": (lambda p: p.conditions(smooth(p.cloud.points) * p.u), [EVEN, *UNEVEN], 1e-12),
+    "detect_boundary": (lambda p: js.detect_boundary(p.cloud).astype(float), UNEVEN, 0),
+    "eliminate": (lambda p: p.conditions(smooth(p.cloud.points) * p.u), [EVEN, *UNEVEN], 1e-12),
     "solve": (
         lambda p: (
             js.solve(p.laplacian, smooth(p.cloud.points), conditions=p.conditions, rtol=1e-12).value

@@ -56,7 +56,7 @@ def test_modes_of_another_operator_compile_nothing():
     cloud = js.sphere(330)
     operators = [s * js.laplace_beltrami(cloud, method=METHOD) for s in (1.0, 2.0)]
     cap = cloud.points[:, 2] > 0.8
-    closures = [js.close(cloud, js.dirichlet(cap, value)) for value in (0.0, 1.0)]
+    closures = [js.eliminate(cloud, js.dirichlet(cap, value)) for value in (0.0, 1.0)]
 
     def programs(operator, closure=None):
         with count_compilations() as names:

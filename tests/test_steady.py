@@ -87,7 +87,7 @@ def test_conditions_are_met_and_equations_hold_elsewhere(sphere):
     cloud, laplacian, _ = sphere
     z = cloud.points[:, 2]
     band = np.flatnonzero(np.abs(z) < 0.05)
-    conditions = js.close(cloud, js.dirichlet(band, z[band] + 1.0))
+    conditions = js.eliminate(cloud, js.dirichlet(band, z[band] + 1.0))
     found = js.solve(laplacian, -2 * z, conditions=conditions)
     assert float(jnp.abs(found.value - z - 1)[band].max()) < 1e-14
     assert float(jnp.abs(found.value - z - 1).max()) < 2e-3
@@ -167,7 +167,7 @@ def test_derivatives_with_conditions_and_jacobi(sphere):
     operator = 1 - laplacian
 
     def total(values, f, weights):
-        conditions = js.close(cloud, js.dirichlet(cap, values))
+        conditions = js.eliminate(cloud, js.dirichlet(cap, values))
         moved = eqx.tree_at(lambda o: o.weights, operator, weights)
         found = js.solve(
             moved, f, conditions=conditions, mean_zero=False, rtol=1e-13,
@@ -188,7 +188,7 @@ def test_the_transposed_system_with_flux_conditions():
     down = jnp.array([0.0, 0.0, -1.0])
     conormals = down - points[border] * (points[border] @ down)[:, None]
     conormals = conormals / jnp.linalg.norm(conormals, axis=1, keepdims=True)
-    conditions = js.close(patch, js.neumann(border, 0.0, conormals=conormals))
+    conditions = js.eliminate(patch, js.neumann(border, 0.0, conormals=conormals))
     laplacian = js.laplace_beltrami(patch, throw=False)
     preconditioner = js.multigrid(laplacian, conditions=conditions)
     assert preconditioner.mean_zero

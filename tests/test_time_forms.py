@@ -234,7 +234,7 @@ def test_upwinding_mapped_and_in_single_precision():
     lists, u = js.find_neighbors(circle, k=9), jnp.sin(3 * angles)
 
     def damped(cloud, lists, velocity, u):
-        return js.upwinding(cloud, velocity, neighbors=lists, method=METHOD)(u)
+        return js.upwind_viscosity(cloud, velocity, neighbors=lists, method=METHOD)(u)
 
     both = jnp.stack([turn, 2 * turn])
     found = jax.jit(jax.vmap(lambda v: damped(circle, lists, v, u)))(both)

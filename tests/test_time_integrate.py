@@ -182,7 +182,7 @@ def test_what_cannot_grow_is_stopped_when_it_does(steps):
 def test_advection_without_damping_warns():
     problem = js.AdvectionDiffusionReaction(gradient=RING_GRADIENT, velocity=RING_TURN)
     assert "hyperviscosity" in js.choose_solver(problem)[1]
-    with pytest.warns(UserWarning, match="upwinding"):
+    with pytest.warns(UserWarning, match="upwind_viscosity"):
         solution = js.integrate(problem, jnp.sin(ANGLES), t1=0.1)
     assert "hyperviscosity" in solution.stats["solver"]
 

@@ -106,7 +106,7 @@ def test_damping_moves_all_eigenvalues_of_advection_to_the_left(cloud):
     assert scipy.linalg.eigvals(matrix).real.max() > 1e-3
     assert growth(js.hyperviscosity(laplacian, 1.0, power=2, strength=0.3)) < 1e-10
     assert growth(js.hyperviscosity(laplacian, 1.0, power=3)) < 1e-4
-    upwind = js.upwinding(cloud, velocity, neighbors=neighbors, method=METHOD)
+    upwind = js.upwind_viscosity(cloud, velocity, neighbors=neighbors, method=METHOD)
     assert growth(upwind) < 1e-10
 
 
@@ -187,7 +187,7 @@ def test_conditions():
     z = cloud.points[:, 2]
     near = jnp.abs(z) < 0.1
     laplacian = js.laplace_beltrami(cloud)
-    closure = js.close(cloud, [js.dirichlet(near, lambda t: jnp.exp(-2 * t) * z[near])])
+    closure = js.eliminate(cloud, [js.dirichlet(near, lambda t: jnp.exp(-2 * t) * z[near])])
     problem = js.AdvectionDiffusionReaction(laplacian, conditions=closure)
     for solver in (js.RKC2(), js.IMEX(order=3), js.SDIRK(order=3)):
         u = js.integrate(problem, z, t1=0.5, solver=solver, rtol=1e-6, atol=1e-7).ys[-1]
@@ -200,7 +200,7 @@ def test_conditions():
 def test_wave_conditions_bind_the_velocity_too():
     near = jnp.abs(Z) < 0.1
     omega = np.sqrt(2.0)
-    closure = js.close(CLOUD, [js.dirichlet(near, lambda t: jnp.cos(omega * t) * Z[near])])
+    closure = js.eliminate(CLOUD, [js.dirichlet(near, lambda t: jnp.cos(omega * t) * Z[near])])
     problem = js.WaveEquation(LAPLACIAN, conditions=closure)
     value, velocity = js.integrate(problem, (Z, 0 * Z), t1=1.0, rtol=1e-7, atol=1e-8).ys
     assert float(jnp.abs(value[-1] - np.cos(omega) * Z).max()) < 2e-3
@@ -254,7 +254,7 @@ def test_misuse_seen_in_the_rate():
     with pytest.raises(ValueError, match="strength = -1"):
         js.hyperviscosity(LAPLACIAN, 1.0, strength=-1)
     with pytest.raises(ValueError, match="velocity has shape"):
-        js.upwinding(CLOUD, TURN[:3])
+        js.upwind_viscosity(CLOUD, TURN[:3])
 
 
 # --- derivatives of whole integrations, conditions, problems of one's own -------------------
@@ -325,7 +325,7 @@ def test_heat_under_flux_conditions(kind, ghosts):
     if ghosts:
         wide, closure = js.with_ghosts(cloud, [flux, rest], method=method)
     else:
-        wide, closure = cloud, js.close(cloud, [flux, rest], method=method)
+        wide, closure = cloud, js.eliminate(cloud, [flux, rest], method=method)
     problem = js.AdvectionDiffusionReaction(
         js.laplace_beltrami(wide, method=method), conditions=closure
     )
@@ -375,9 +375,11 @@ def test_a_problem_and_a_preconditioner_of_ones_own():
 
 def test_upwinding_takes_the_neighbours_given_also_under_jit():
     cloud = js.PointCloud(CLOUD.points, CLOUD.normals)  # no spacing of its own
-    make = lambda v, near: js.upwinding(cloud, v, neighbors=near).weights
+    make = lambda v, near: js.upwind_viscosity(cloud, v, neighbors=near).weights
     near = js.choose_neighbors(cloud)
-    moved = jax.jit(lambda p, v: js.upwinding(js.PointCloud(p, p), v, neighbors=near).weights)
+    moved = jax.jit(
+        lambda p, v: js.upwind_viscosity(js.PointCloud(p, p), v, neighbors=near).weights
+    )
     np.testing.assert_allclose(moved(cloud.points, TURN), make(TURN, near), rtol=1e-8, atol=1e-8)
 
 
@@ -389,7 +391,7 @@ def test_upwinding_is_differentiable():
 
     def damped(points, velocity):
         made = js.PointCloud(points, cloud.normals)
-        return jnp.sum(js.upwinding(made, velocity, neighbors=near)(u) ** 2)
+        return jnp.sum(js.upwind_viscosity(made, velocity, neighbors=near)(u) ** 2)
 
     check_derivative(lambda v: damped(cloud.points, v), turn)
     check_derivative(lambda p: damped(p, turn), cloud.points, rtol=1e-5)

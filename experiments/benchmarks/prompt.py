@@ -82,13 +82,13 @@ class Made:
             "laplacian": lambda: js.laplace_beltrami(self.cloud),
             "gradient": lambda: js.surface_gradient(self.cloud),
             "conditions": lambda: js.dirichlet(self.cloud.boundary),
-            "closure": lambda: js.close(self.cloud, self.conditions),
+            "closure": lambda: js.eliminate(self.cloud, self.conditions),
             "preconditioner": lambda: js.multigrid(self.laplacian),
             "problem": lambda: js.AdvectionDiffusionReaction(
                 self.laplacian, diffusivity=self.number
             ),
             # Once, with room for all that is searched.
-            "capacity": lambda: js.allocate(js.sphere(N).points, 0.2),
+            "capacity": lambda: js.allocate_search(js.sphere(N).points, 0.2),
             "spin": lambda: jnp.cross(jnp.array([0.0, 0.0, 1.0]), self.cloud.points),
         }[name]()
         self.__dict__[name] = value
@@ -158,7 +158,7 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
         "laplacian closure",
         lambda m: js.solve(m.laplacian, m.u, conditions=m.closure).value,
     ),
-    "close": ("open", "conditions", lambda m: js.close(m.cloud, m.conditions)),
+    "eliminate": ("open", "conditions", lambda m: js.eliminate(m.cloud, m.conditions)),
     "with_ghosts": ("open", "", lambda m: js.with_ghosts(m.cloud, js.neumann(m.cloud.boundary))),
     "solve_nonlinear": (
         "closed",
@@ -196,7 +196,7 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
         "laplacian",
         lambda m: js.hyperviscosity(m.laplacian, 1.0 * m.number)(m.u),
     ),
-    "upwinding": ("closed", "spin", lambda m: js.upwinding(m.cloud, m.spin).weights),
+    "upwind_viscosity": ("closed", "spin", lambda m: js.upwind_viscosity(m.cloud, m.spin).weights),
 }  # fmt: skip
 
 

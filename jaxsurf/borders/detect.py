@@ -17,7 +17,7 @@ from ..sheets import nearest
 _RING, _GAP = 16, 2.1
 
 
-def detect_border(cloud: PointCloud, *, k: int = _RING, gap: float = _GAP) -> Bool[Array, " n"]:
+def detect_boundary(cloud: PointCloud, *, k: int = _RING, gap: float = _GAP) -> Bool[Array, " n"]:
     """Points of a cloud that look like border points, for `PointCloud.boundary`.
 
     Seen from an inner point the neighbours lie all around; at a border they leave an angle
@@ -39,7 +39,7 @@ def detect_border(cloud: PointCloud, *, k: int = _RING, gap: float = _GAP) -> Bo
     Example:
         >>> bowl = lambda s: (jnp.sin(s), -jnp.cos(s))
         >>> cap = js.surface_of_revolution(bowl, 800)
-        >>> bool((js.detect_border(cap) == cap.boundary).all())
+        >>> bool((js.detect_boundary(cap) == cap.boundary).all())
         True
     """
     instance(cloud, PointCloud, "cloud")

@@ -94,7 +94,7 @@ def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
     on = cloud.host_active
     marked = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary) & on
     if not marked.any():
-        raise ValueError("no point is marked in cloud.boundary; see detect_border")
+        raise ValueError("no point is marked in cloud.boundary; see detect_boundary")
     points = np.asarray(cloud.points, float)
     inside = inward(points, np.flatnonzero(on), np.flatnonzero(marked))
     if cloud.dim == 2:

@@ -19,7 +19,7 @@ from . import invariant
 from .invariant import Subspace
 
 
-class Eigenmodes(eqx.Module):
+class Modes(eqx.Module):
     r"""Lowest modes of minus an operator, $-A f = \lambda f$.
 
     Args:
@@ -45,7 +45,7 @@ class Eigenmodes(eqx.Module):
 
     def __repr__(self):
         n, k = self.functions.shape
-        return f"Eigenmodes({k} modes of {n} points, {self._described()})"
+        return f"Modes({k} modes of {n} points, {self._described()})"
 
     def _described(self) -> str:
         if not is_concrete(self.values, self.residuals):
@@ -61,7 +61,7 @@ def eigenmodes(
     *,
     conditions: Closure | None = None,
     degenerate: float = 1e-3,
-) -> Eigenmodes:
+) -> Modes:
     r"""The lowest k modes of minus an operator, as a rule the Laplace–Beltrami operator.
 
     Shift and invert on the host: Arnoldi's method for $(-A - \sigma)^{-1}$ with a small
@@ -77,7 +77,7 @@ def eigenmodes(
             few close to zero.
         k: number of modes, the constants of a closed surface counted. A group cut off by k
             has neither a symmetric function nor a whole basis: see `groups`.
-        conditions: from `close`; their homogeneous part defines the modes. Closed surfaces,
+        conditions: from `eliminate`; their homogeneous part defines the modes. Closed surfaces,
             and borders that the operator itself provides for, need none.
         degenerate: relative distance of neighbouring values within a group.
 
@@ -105,7 +105,7 @@ def eigenmodes(
     instance(operator, AbstractOperator, "operator", "js.laplace_beltrami(cloud) makes one")
     check_scalar(operator)
     if conditions is not None:
-        instance(conditions, Closure, "conditions", "js.close(cloud, conditions) makes one")
+        instance(conditions, Closure, "conditions", "js.eliminate(cloud, conditions) makes one")
     check_border(operator, conditions)
     k, degenerate = whole(k, "k"), float(real(degenerate, "degenerate", least=0, below=1))
     n = operator.n
@@ -117,7 +117,7 @@ def eigenmodes(
     values, functions, *others = _modes(system, k, degenerate)
     if conditions is not None:
         functions = conditions.homogeneous(functions)
-    return Eigenmodes(values, functions, *others)
+    return Modes(values, functions, *others)
 
 
 class _System(eqx.Module):

@@ -61,7 +61,7 @@ def solve_nonlinear(
         u0: where to start, `(n,)`.
         args: parameters of the reaction, any pytree; derivatives in them need them here.
         rhs: f, `(n,)` or a number.
-        conditions: from `js.close` or `js.with_ghosts`.
+        conditions: from `js.eliminate` or `js.with_ghosts`.
         preconditioner: for $L + r'$; `js.multigrid` of it at u0 if None, under
             `jit` and `vmap` where the neighbours are concrete. One serves all steps.
         solver: of the linear systems; `js.BiCGStab` if None, loosely but for derivatives.

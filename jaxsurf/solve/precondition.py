@@ -55,7 +55,7 @@ class AbstractPreconditioner(AbstractOperator):
         """An approximate solution u of A u = r; linear in r."""
 
 
-class Jacobi(AbstractPreconditioner):
+class JacobiPreconditioner(AbstractPreconditioner):
     """Division by the diagonal. Needs no set-up, and works on traced operators.
 
     Args:
@@ -123,7 +123,7 @@ class Level(eqx.Module):
         return Level(matrix, self.matrix, self.inverse, self.restrict, self.prolong, self.damping)
 
 
-class Multigrid(AbstractPreconditioner):
+class VCycle(AbstractPreconditioner):
     """A V-cycle of smoothed aggregation: made by `multigrid`.
 
     Args:
@@ -151,7 +151,7 @@ class Multigrid(AbstractPreconditioner):
     def __repr__(self):
         sizes = " > ".join(map(str, self.sizes))
         where = ", singular: constants" if self.mean_zero else ""
-        return f"Multigrid({sizes} unknowns, {self.coarsest.dtype.name}{where})"
+        return f"VCycle({sizes} unknowns, {self.coarsest.dtype.name}{where})"
 
     def __call__(self, r):
         # The cycle is linear, so that a residual of any size can be brought to size one,
@@ -170,11 +170,9 @@ class Multigrid(AbstractPreconditioner):
         return level.smooth(x, b)
 
     def transpose(self):
-        return Multigrid(self.mean_zero, tuple(v.T for v in self.levels), self.coarsest.T)
+        return VCycle(self.mean_zero, tuple(v.T for v in self.levels), self.coarsest.T)
 
-    def renewed(
-        self, operator: AbstractOperator, *, conditions: Closure | None = None
-    ) -> Multigrid:
+    def renewed(self, operator: AbstractOperator, *, conditions: Closure | None = None) -> VCycle:
         r"""The hierarchy of another operator on the same points: same aggregates, other numbers.
 
         Runs under `jit`, `vmap` and `grad`, for traced weights and neighbours, conditions and
@@ -184,7 +182,7 @@ class Multigrid(AbstractPreconditioner):
         Args:
             operator: scalar; one of which the diagonal is known. It annihilates the constants if
                 the first one did.
-            conditions: from `js.close` or `js.with_ghosts`; if there were some at first.
+            conditions: from `js.eliminate` or `js.with_ghosts`; if there were some at first.
 
         Raises:
             TypeError: what is no operator or closure.
@@ -227,7 +225,9 @@ class _Product(AbstractPreconditioner):
         return _Product(self.mean_zero, *both)
 
 
-def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> Jacobi:
+def jacobi(
+    operator: AbstractOperator, *, conditions: Closure | None = None
+) -> JacobiPreconditioner:
     r"""The diagonal of an operator as a preconditioner.
 
     Needs no optional package and no concrete arrays, but takes of the order of $1/h$ steps:
@@ -235,7 +235,7 @@ def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> 
 
     Args:
         operator: a stencil from scalar fields to scalar fields; may be traced.
-        conditions: from `js.close` or `js.with_ghosts`.
+        conditions: from `js.eliminate` or `js.with_ghosts`.
 
     Returns:
         To be passed to `js.solve`.
@@ -253,7 +253,7 @@ def jacobi(operator: AbstractOperator, *, conditions: Closure | None = None) -> 
     diagonal = switched_off(operator.active, diagonal, 1)
     if conditions is not None:
         diagonal = jnp.where(conditions.bound, 1, diagonal)
-    return Jacobi(None, jax.lax.stop_gradient(diagonal))
+    return JacobiPreconditioner(None, jax.lax.stop_gradient(diagonal))
 
 
 def multigrid(
@@ -277,10 +277,10 @@ def multigrid(
     Args:
         operator: scalar, with concrete neighbours. For an indefinite Helmholtz operator
             $\Delta + \kappa^2$ pass $\Delta - \kappa^2$ here.
-        conditions: from `js.close` or `js.with_ghosts`; the same as for `js.solve`.
+        conditions: from `js.eliminate` or `js.with_ghosts`; the same as for `js.solve`.
         single: hold and run the cycle in single precision, which halves its time. The solution
             is not affected: its residual is computed in the precision of the operator.
-        renewable: keep what `Multigrid.renewed` needs to serve other weights in compiled code.
+        renewable: keep what `VCycle.renewed` needs to serve other weights in compiled code.
         mean_zero: whether an operator of traced weights annihilates the constants; of concrete
             ones it is seen.
 
@@ -314,7 +314,7 @@ def multigrid(
     return made.renewed(operator, conditions=conditions)
 
 
-def _hierarchy(operator, conditions, single, renewable, mean_zero=None) -> Multigrid:
+def _hierarchy(operator, conditions, single, renewable, mean_zero=None) -> VCycle:
     fine = reduced_matrix(operator, conditions)
     free = restriction_of(operator, conditions).on_host
     mean_zero = annihilates_constants(fine, free) if mean_zero is None else mean_zero
@@ -342,7 +342,7 @@ def _hierarchy(operator, conditions, single, renewable, mean_zero=None) -> Multi
     used = np.arange(room) < size
     coarsest = aggregation.dense_inverse(dense, used, constant if mean_zero else None).astype(dtype)
     plan = renewal.plan_of(made, [(v.matrix, v.transposed) for v in levels]) if renewable else None
-    return Multigrid(mean_zero, tuple(levels), jnp.asarray(coarsest), plan)
+    return VCycle(mean_zero, tuple(levels), jnp.asarray(coarsest), plan)
 
 
 def _level(matrix, tentative, dtype, room: int, coarse: int, width, on):
@@ -368,7 +368,7 @@ def _level(matrix, tentative, dtype, room: int, coarse: int, width, on):
 
 
 @sized_jit
-def _renewed(plan, operator, conditions, mean_zero: bool, dtype) -> Multigrid:
+def _renewed(plan, operator, conditions, mean_zero: bool, dtype) -> VCycle:
     matrix, restriction = free_operator(operator, conditions)
     below, free = renewal.free_divisor(operator, matrix, restriction)
     if not restriction.all_free:
@@ -388,4 +388,4 @@ def _renewed(plan, operator, conditions, mean_zero: bool, dtype) -> Multigrid:
         for v in found
     )
     coarsest = aggregation.dense_inverse(dense, constant > 0, constant if mean_zero else None)
-    return Multigrid(mean_zero, renewal.narrowed(levels, dtype), coarsest.astype(dtype))
+    return VCycle(mean_zero, renewal.narrowed(levels, dtype), coarsest.astype(dtype))

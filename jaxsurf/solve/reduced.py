@@ -25,7 +25,7 @@ def check_kinds(operator, conditions) -> None:
     instance(operator, AbstractOperator, "operator", "js.laplace_beltrami(cloud) makes one")
     check_scalar(operator)
     if conditions is not None:
-        hint = "js.close(cloud, conditions) makes one of conditions"
+        hint = "js.eliminate(cloud, conditions) makes one of conditions"
         instance(conditions, Closure, "conditions", hint)
         as_many("conditions", conditions.n, "the operator", operator.n)
 

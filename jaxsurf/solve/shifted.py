@@ -16,7 +16,7 @@ from ..stencils.algebra import AbstractOperator
 from ..stencils.padded import PaddedMatrix
 from ..stencils.stencil import Stencil
 from . import aggregation, renewal
-from .precondition import USED, Level, Multigrid
+from .precondition import USED, Level, VCycle
 from .reduced import check_kinds, free_matrix, free_operator
 
 # The coarsest system has at most this many unknowns; its inverse is computed for every g.
@@ -82,16 +82,16 @@ class ShiftedMultigrid(eqx.Module):
     stiff: Float[Array, "m m"]
     plan: tuple[renewal.Coarsening, ...] | None = None
 
-    def at(self, g: ArrayLike) -> Multigrid:
+    def at(self, g: ArrayLike) -> VCycle:
         """The V-cycle for one g, which may be traced."""
         g = jnp.asarray(g).astype(self.mass.dtype)
         levels = tuple(pair.at(g) for pair in self.pairs)
-        return Multigrid(False, levels, jnp.linalg.inv(self.mass - g * self.stiff))
+        return VCycle(False, levels, jnp.linalg.inv(self.mass - g * self.stiff))
 
     def renewed(
         self, operator: AbstractOperator, *, conditions: Closure | None = None
     ) -> ShiftedMultigrid:
-        """The hierarchies of another operator on the same points, as `Multigrid.renewed`."""
+        """The hierarchies of another operator on the same points, as `VCycle.renewed`."""
         n = len(self.pairs[0].stiff_diagonal if self.pairs else self.stiff)
         return _renewed(*renewal.check_renewal(self.plan, n, operator, conditions))
 
@@ -106,7 +106,7 @@ def shifted_multigrid(
 
     Args:
         operator: A, scalar, with concrete arrays and eigenvalues of real part ≤ 0.
-        conditions: from `js.close` or `js.with_ghosts`.
+        conditions: from `js.eliminate` or `js.with_ghosts`.
         renewable: keep what `ShiftedMultigrid.renewed` needs.
 
     Returns:

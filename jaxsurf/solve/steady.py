@@ -59,7 +59,7 @@ def solve(
         operator: A, a scalar stencil such as `js.laplace_beltrami(...)`, shifted and scaled at
             will, or a composition.
         rhs: f, `(n,)` or `(n, c)` for c problems at once; values at bound points do not count.
-        conditions: from `js.close` or `js.with_ghosts`.
+        conditions: from `js.eliminate` or `js.with_ghosts`.
         preconditioner: `js.multigrid(operator, conditions=conditions)` if None, also under
             `grad`, and with `mean_zero` under `jit` and `vmap` where the neighbours are concrete.
             Where these are traced, make it outside and pass it, `renewed` inside where the

@@ -118,7 +118,7 @@ def check_closure(conditions: Any, n: int | None) -> None:
     """Raise on what is not a closure for n points."""
     if conditions is None:
         return
-    hint = "close(cloud, conditions) or with_ghosts makes one from conditions"
+    hint = "eliminate(cloud, conditions) or with_ghosts makes one from conditions"
     instance(conditions, Closure, "conditions", hint)
     if n is not None and conditions.n != n:
         raise ValueError(f"conditions are for {conditions.n} points, the operators have {n}")

@@ -50,7 +50,7 @@ class BiharmonicDiffusion(_FourthOrder):
         laplacian: the Laplace–Beltrami operator; it is applied twice.
         stiffness: κ in units of length⁴ / time, a number.
         reaction: `(t, u, args) -> f`; None for none.
-        conditions: from `close` or `with_ghosts`, for u and, with zero data, for its
+        conditions: from `eliminate` or `with_ghosts`, for u and, with zero data, for its
             Laplacian; None for closed surfaces.
         mass: weights m, `(n,)`: $\sum_i m_i u_i$ is then conserved to round-off.
 
@@ -120,7 +120,7 @@ class CahnHilliard(_FourthOrder):
         mobility: M, in units of length² / time.
         potential: W', a function of u.
         splitting: s.
-        conditions: no-flux conditions from `close` or `with_ghosts`, for u and the chemical
+        conditions: no-flux conditions from `eliminate` or `with_ghosts`, for u and the chemical
             potential; None for closed surfaces.
         mass: weights m, `(n,)`: $\sum_i m_i u_i$ is then conserved to round-off.
 
@@ -204,7 +204,7 @@ class WaveEquation(AbstractEvolution):
         forcing: `(t, u, args) -> f`; None for none.
         stabilization: an operator that acts on $\partial_t u$, added to the right-hand side:
             `hyperviscosity` where waves near the spacing of the points grow.
-        conditions: from `close` or `with_ghosts`; None for closed surfaces.
+        conditions: from `eliminate` or `with_ghosts`; None for closed surfaces.
 
     Differentiable: in every array, forward and reverse.
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ..arguments import as_float
 from ..functions import canonical
-from ..solve.precondition import Multigrid
+from ..solve.precondition import VCycle
 from ..solve.shifted import ShiftedMultigrid, shifted_multigrid
 from ..stencils.lineax import Square, matrix_free
 from .problem import AbstractEvolution, checked_problem
@@ -48,7 +48,7 @@ class StepPreconditioner(eqx.Module):
     ) -> StepPreconditioner:
         """That of another problem on the same points: same aggregates, other numbers.
 
-        Runs under `jit`, `vmap` and `grad`, see `Multigrid.renewed`. A constant for derivatives.
+        Runs under `jit`, `vmap` and `grad`, see `VCycle.renewed`. A constant for derivatives.
 
         Args:
             problem: of the kind that this was made for.
@@ -76,7 +76,7 @@ class StepInverse(Square):
         structure: of the state.
     """
 
-    cycles: list[list[Multigrid | list[Multigrid]]]
+    cycles: list[list[VCycle | list[VCycle]]]
     shapes: tuple[jax.ShapeDtypeStruct, ...] = eqx.field(static=True)
     structure: Any = eqx.field(static=True)
 
@@ -95,7 +95,7 @@ class StepInverse(Square):
         return self.structure.unflatten(self.shapes)
 
 
-def _through(cycles: list[Multigrid | list[Multigrid]], field: Array) -> Array:
+def _through(cycles: list[VCycle | list[VCycle]], field: Array) -> Array:
     for cycle in cycles:
         if isinstance(cycle, list):
             columns = [one(v) for one, v in zip(cycle, field.T)]

@@ -72,7 +72,7 @@ def hyperviscosity(
     return damping
 
 
-def upwinding(
+def upwind_viscosity(
     cloud: PointCloud,
     velocity: Float[Array, "n d"],
     *,
@@ -105,7 +105,7 @@ def upwinding(
     Example:
         >>> cloud = js.sphere(300)
         >>> x, y, z = cloud.points.T
-        >>> damping = js.upwinding(cloud, jnp.stack([-y, x, 0 * z], axis=1))
+        >>> damping = js.upwind_viscosity(cloud, jnp.stack([-y, x, 0 * z], axis=1))
         >>> bool(jnp.vdot(x, damping(x)) < 0)
         True
     """

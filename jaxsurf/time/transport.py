@@ -40,7 +40,7 @@ from .problem import (
 
 _UNDAMPED = (
     "without diffusion or damping short waves may grow on scattered points: see "
-    "`stabilization=`, `hyperviscosity` and `upwinding`"
+    "`stabilization=`, `hyperviscosity` and `upwind_viscosity`"
 )
 
 
@@ -62,8 +62,8 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         reaction: `(t, u, args) -> f`, of the shape of u; None for none.
         conservative: the form above; if False $v\cdot\nabla u$ in place of $\nabla\cdot(v\,u)$.
         stabilization: an operator added to the right-hand side, that damps what advection
-            cannot resolve: `hyperviscosity` or `upwinding`.
-        conditions: from `close` or `with_ghosts`; None for closed surfaces.
+            cannot resolve: `hyperviscosity` or `upwind_viscosity`.
+        conditions: from `eliminate` or `with_ghosts`; None for closed surfaces.
         mass: weights m, `(n,)`. If given, transport is corrected by the smallest change that
             keeps $\sum_i m_i u_i$: a shift of the rate by its mean. Conserves to round-off.
 

@@ -56,7 +56,7 @@ def border() -> js.Border:
 
 @functools.cache
 def closure() -> js.Closure:
-    return js.close(square(), js.dirichlet(border_points(), 1.0))
+    return js.eliminate(square(), js.dirichlet(border_points(), 1.0))
 
 
 @functools.cache
@@ -176,72 +176,75 @@ CASES = [
              ("conormals", "(3,)", "(1, 3)")),
         ]
     ),
-    # --- close
+    # --- eliminate
     *(
-        Case("close", f"conditions: {label}", lambda v=v: js.close(square(), v), ("conditions", w))
+        Case("eliminate", f"conditions: {label}", lambda v=v: js.eliminate(square(), v),
+             ("conditions", w))
         for label, (v, w) in _not_a_condition.items()
     ),
     *(
-        Case("close", label, call, words)
+        Case("eliminate", label, call, words)
         for label, call, words in [
-            ("cloud is None", lambda: js.close(None, js.dirichlet([3])), ("cloud", "None")),
-            ("cloud is an array", lambda: js.close(np.ones((5, 3)), js.dirichlet([3])),
+            ("cloud is None", lambda: js.eliminate(None, js.dirichlet([3])), ("cloud", "None")),
+            ("cloud is an array", lambda: js.eliminate(np.ones((5, 3)), js.dirichlet([3])),
              ("cloud", "(5, 3)", "PointCloud")),
-            ("a mask of 5 points", lambda: js.close(square(), js.dirichlet(np.ones(5, bool))),
+            ("a mask of 5 points", lambda: js.eliminate(square(), js.dirichlet(np.ones(5, bool))),
              ("condition 0", "5 points", "81")),
-            ("a mask that is too long", lambda: js.close(square(), js.neumann(np.ones(99, bool))),
+            ("a mask that is too long",
+             lambda: js.eliminate(square(), js.neumann(np.ones(99, bool))),
              ("condition 0", "99", "81")),
-            ("a point out of range", lambda: js.close(square(), js.dirichlet([3, 81])),
+            ("a point out of range", lambda: js.eliminate(square(), js.dirichlet([3, 81])),
              ("point 81", "there are 81")),
-            ("all points bound", lambda: js.close(square(), js.dirichlet(np.ones(N, bool))),
+            ("all points bound", lambda: js.eliminate(square(), js.dirichlet(np.ones(N, bool))),
              ("all 81 points",)),
             ("two conditions at a point",
-             lambda: js.close(square(), [js.dirichlet([3, 4]), js.dirichlet([4], 1.0)]),
+             lambda: js.eliminate(square(), [js.dirichlet([3, 4]), js.dirichlet([4], 1.0)]),
              ("point 4", "condition 0", "condition 1")),
-            ("free and not free", lambda: js.close(square(), [js.dirichlet([3]), js.free([3])]),
+            ("free and not free", lambda: js.eliminate(square(), [js.dirichlet([3]), js.free([3])]),
              ("point 3", "agree")),
-            ("no conormal", lambda: js.close(square(), js.neumann([INNER])),
+            ("no conormal", lambda: js.eliminate(square(), js.neumann([INNER])),
              ("conormal", f"point {INNER}", "boundary")),
-            ("no border", lambda: js.close(closed(), js.neumann([3])), ("conormal", "point 3")),
+            ("no border", lambda: js.eliminate(closed(), js.neumann([3])), ("conormal", "point 3")),
             ("conormals that are normals",
-             lambda: js.close(square(), js.neumann(LEFT, conormals=np.tile([0, 0, 1.0], (7, 1)))),
+             lambda: js.eliminate(
+                 square(), js.neumann(LEFT, conormals=np.tile([0, 0, 1.0], (7, 1)))),
              ("conormal at point 1", "tangent", "0.05")),
             ("conormals inward",
-             lambda: js.close(square(), js.neumann(LEFT, conormals=conormals(i3=[1, 0, 0]))),
+             lambda: js.eliminate(square(), js.neumann(LEFT, conormals=conormals(i3=[1, 0, 0]))),
              ("conormal at point 4", "into", "outward")),
             ("conormals in the plane",
-             lambda: js.close(square(), js.neumann(LEFT, conormals=conormals()[:, :2])),
+             lambda: js.eliminate(square(), js.neumann(LEFT, conormals=conormals()[:, :2])),
              ("conormals", "(7, 2)", "3")),
             ("neighbors is a number",
-             lambda: js.close(square(), js.neumann(border_points()), neighbors=20),
+             lambda: js.eliminate(square(), js.neumann(border_points()), neighbors=20),
              ("neighbors", "20", "find_neighbors")),
             ("neighbors of another cloud",
-             lambda: js.close(small(), js.dirichlet([0]), neighbors=neighbors()), ("81", "2")),
+             lambda: js.eliminate(small(), js.dirichlet([0]), neighbors=neighbors()), ("81", "2")),
             ("few neighbors",
-             lambda: js.close(square(), js.neumann(border_points()), neighbors=neighbors(6)),
+             lambda: js.eliminate(square(), js.neumann(border_points()), neighbors=neighbors(6)),
              ("free neighbours", "at least 5")),
-            ("method is text", lambda: js.close(square(), js.dirichlet([3]), method="gfdm"),
+            ("method is text", lambda: js.eliminate(square(), js.dirichlet([3]), method="gfdm"),
              ("method", "gfdm")),
-            ("method is a class", lambda: js.close(square(), js.dirichlet([3]), method=js.GFDM),
+            ("method is a class", lambda: js.eliminate(square(), js.dirichlet([3]), method=js.GFDM),
              ("method", "GFDM")),
             ("border is a mask",
-             lambda: js.close(square(), js.neumann(LEFT), border=square().boundary),
+             lambda: js.eliminate(square(), js.neumann(LEFT), border=square().boundary),
              ("border", "(81,)", "find_border")),
             ("border of a larger cloud",
-             lambda: js.close(small(), js.dirichlet([0]), border=border()),
+             lambda: js.eliminate(small(), js.dirichlet([0]), border=border()),
              ("border", "point 9", "2")),
-            ("a and b zero", lambda: js.close(square(), js.robin(LEFT, a=0.0, b=0.0)),
+            ("a and b zero", lambda: js.eliminate(square(), js.robin(LEFT, a=0.0, b=0.0)),
              ("does not determine", "point 1")),
         ]
     ),
     Case(
-        "close", "a cloud in float32 and values in float64",
-        lambda: js.close(square(np.float32), js.dirichlet(LEFT, np.ones(7))),
+        "eliminate", "a cloud in float32 and values in float64",
+        lambda: js.eliminate(square(np.float32), js.dirichlet(LEFT, np.ones(7))),
         right=lambda c: c(jnp.zeros(N, jnp.float32)).dtype == jnp.float32
         and c.offset().dtype == jnp.float32,
     ),
     Case(
-        "close", "huge points", lambda: js.close(
+        "eliminate", "huge points", lambda: js.eliminate(
             js.PointCloud(1e150 * square().points, square().normals, boundary=square().boundary),
             js.neumann(LEFT), neighbors=neighbors(),
         )(jnp.ones(N)),
@@ -263,10 +266,10 @@ CASES = [
             ("extend: too many points", lambda: closure().extend(np.zeros(99)), ("(99,)", "81")),
             ("extend: a number", lambda: closure().extend(1.0), ("field", "()")),
             ("components for a field without",
-             lambda: js.close(square(), js.dirichlet([3], np.ones((1, 2))))(np.zeros(N)),
+             lambda: js.eliminate(square(), js.dirichlet([3], np.ones((1, 2))))(np.zeros(N)),
              ("components (2,)", "none")),
             ("other components",
-             lambda: js.close(square(), js.dirichlet([3], np.ones((1, 2))))(np.zeros((N, 3))),
+             lambda: js.eliminate(square(), js.dirichlet([3], np.ones((1, 2))))(np.zeros((N, 3))),
              ("components (2,)", "(3,)")),
             ("weights of another shape",
              lambda: js.Closure(9, np.array([1]), np.zeros((2, 1), int), np.zeros((3, 1))),
@@ -291,7 +294,7 @@ CASES = [
         Case(name, f"cloud: {label}", functools.partial(f, v), ("cloud", w))
         for name, f in {
             "find_border": js.find_border,
-            "detect_border": js.detect_border,
+            "detect_boundary": js.detect_boundary,
             "border_conormals": js.border_conormals,
             "with_ghosts": lambda v: js.with_ghosts(v, js.neumann([3])),
         }.items()
@@ -313,15 +316,19 @@ CASES = [
             ("find_border", "text as mesh", lambda: js.find_border(square(), "a.obj"),
              ("mesh", "a.obj")),
             ("find_border", "another mesh", lambda: js.find_border(square(), mesh()), ("3", "81")),
-            ("detect_border", "k = 2.5", lambda: js.detect_border(square(), k=2.5), ("k is 2.5",)),
-            ("detect_border", "k = 2", lambda: js.detect_border(square(), k=2), ("k = 2", "3")),
-            ("detect_border", "k = 82", lambda: js.detect_border(square(), k=82), ("82", "81")),
-            ("detect_border", "two points", lambda: js.detect_border(small()), ("k = 16", "2")),
-            ("detect_border", "gap = NaN", lambda: js.detect_border(square(), gap=NAN), ("gap",)),
-            ("detect_border", "gap = 4", lambda: js.detect_border(square(), gap=4.0),
+            ("detect_boundary", "k = 2.5", lambda: js.detect_boundary(square(), k=2.5),
+             ("k is 2.5",)),
+            ("detect_boundary", "k = 2", lambda: js.detect_boundary(square(), k=2), ("k = 2", "3")),
+            ("detect_boundary", "k = 82", lambda: js.detect_boundary(square(), k=82), ("82", "81")),
+            ("detect_boundary", "two points", lambda: js.detect_boundary(small()), ("k = 16", "2")),
+            ("detect_boundary", "gap = NaN", lambda: js.detect_boundary(square(), gap=NAN),
+             ("gap",)),
+            ("detect_boundary", "gap = 4", lambda: js.detect_boundary(square(), gap=4.0),
              ("gap = 4", "3.14")),
-            ("detect_border", "gap = 0", lambda: js.detect_border(square(), gap=0), ("gap = 0",)),
-            ("detect_border", "gap is text", lambda: js.detect_border(square(), gap="2"), ("gap",)),
+            ("detect_boundary", "gap = 0", lambda: js.detect_boundary(square(), gap=0),
+             ("gap = 0",)),
+            ("detect_boundary", "gap is text", lambda: js.detect_boundary(square(), gap="2"),
+             ("gap",)),
             ("border_conormals", "a mask as border",
              lambda: js.border_conormals(square(), square().boundary), ("border", "(81,)")),
             ("border_conormals", "of a larger cloud",

@@ -314,14 +314,14 @@ def search(points=X, **change):
 
 
 SEARCH = [
-    ("allocate", "a negative radius", lambda: js.allocate(X, -1.0), ("radius = -1", "above 0")),
-    ("allocate", "a radius NaN", lambda: js.allocate(X, np.nan), ("radius = nan", "above 0")),
-    ("allocate", "a radius in words", lambda: js.allocate(X, "1"), ("radius", "'1'", "real")),
-    ("allocate", "one axis", lambda: js.allocate(X[:, 0], 1.0), ("points", "(10,)", "(n, 3)")),
-    ("allocate", "a NaN point", lambda: js.allocate(changed(X, (4, 0), np.nan), 1.0), ("points", "point 4", "nan")),
-    ("allocate", "a margin below 1", lambda: js.allocate(X, 1.0, margin=0.5), ("margin = 0.5", "at least 1")),
-    ("allocate", "no points", lambda: js.allocate(np.ones((0, 3)), 1.0), ("points", "(0, 3)", "at least 1")),
-    ("allocate", "active as indices", lambda: js.allocate(X, 1.0, active=[0, 1]), ("active", "int64", "mask")),
+    ("allocate_search", "a negative radius", lambda: js.allocate_search(X, -1.0), ("radius = -1", "above 0")),
+    ("allocate_search", "a radius NaN", lambda: js.allocate_search(X, np.nan), ("radius = nan", "above 0")),
+    ("allocate_search", "a radius in words", lambda: js.allocate_search(X, "1"), ("radius", "'1'", "real")),
+    ("allocate_search", "one axis", lambda: js.allocate_search(X[:, 0], 1.0), ("points", "(10,)", "(n, 3)")),
+    ("allocate_search", "a NaN point", lambda: js.allocate_search(changed(X, (4, 0), np.nan), 1.0), ("points", "point 4", "nan")),
+    ("allocate_search", "a margin below 1", lambda: js.allocate_search(X, 1.0, margin=0.5), ("margin = 0.5", "at least 1")),
+    ("allocate_search", "no points", lambda: js.allocate_search(np.ones((0, 3)), 1.0), ("points", "(0, 3)", "at least 1")),
+    ("allocate_search", "active as indices", lambda: js.allocate_search(X, 1.0, active=[0, 1]), ("active", "int64", "mask")),
     ("search_neighbors", "a cloud", lambda: search(cloud()), ("points", "PointCloud", "real")),
     ("search_neighbors", "a capacity that is a number", lambda: search(capacity=8), ("capacity", "8", "SearchCapacity")),
     ("search_neighbors", "k = 2.5", lambda: search(k=2.5), ("k is 2.5", "whole")),

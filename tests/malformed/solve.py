@@ -32,7 +32,7 @@ def renewable():
 
 
 def pinned():
-    return js.close(problem()[0], js.dirichlet([0], 0.0))
+    return js.eliminate(problem()[0], js.dirichlet([0], 0.0))
 
 
 def marked():
@@ -128,12 +128,12 @@ CASES = [
     *limits("solve", solve),
     *limits("solve_nonlinear", newton),
     Case("solve", "a Condition", lambda: solve(conditions=js.dirichlet([0], 0.0)),
-         ("conditions", "Closure", "js.close")),
+         ("conditions", "Closure", "js.eliminate")),
     Case("solve", "conditions of other points", lambda: js.solve(
-        laplacian(), z(), conditions=js.close(js.sphere(61), js.dirichlet([0], 0.0))),
+        laplacian(), z(), conditions=js.eliminate(js.sphere(61), js.dirichlet([0], 0.0))),
         ("61", "60")),
-    Case("solve", "a class as preconditioner", lambda: solve(preconditioner=js.Jacobi),
-         ("preconditioner",)),
+    Case("solve", "a class as preconditioner",
+         lambda: solve(preconditioner=js.JacobiPreconditioner), ("preconditioner",)),
     Case("solve", "text as solver", lambda: solve(solver="bicgstab"), ("solver", "bicgstab")),
     Case("solve", "complex right-hand side", lambda: solve(rhs=1j * z()),
          ("right-hand side", "complex")),
@@ -146,7 +146,7 @@ CASES = [
     Case("solve", "NaN at a point", lambda: solve(rhs=z().at[7].set(jnp.nan)), ("point 7",)),
     Case("solve", "infinity at a point", lambda: solve(rhs=z().at[9].set(jnp.inf)), ("point 9",)),
     Case("solve", "a border without conditions", lambda: solve(marked()),
-         ("point 0", "js.close", "js.free")),
+         ("point 0", "js.eliminate", "js.free")),
     Case("solve", "a right-hand side of one sign", lambda: solve(rhs=jnp.ones(60)),
          ("right-hand side", "incompatible", "mean is 1", "project=True")),
     Case("solve_nonlinear", "a Condition", lambda: newton(conditions=js.dirichlet([0], 0.0)),

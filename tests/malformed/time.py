@@ -53,7 +53,7 @@ def integrate(problem=None, u0=U, t1=1.0, **settings):
 
 def closure(n=N):
     cloud = js.circle(n)
-    return js.close(cloud, js.dirichlet(jnp.arange(n) < 2, 0.0))
+    return js.eliminate(cloud, js.dirichlet(jnp.arange(n) < 2, 0.0))
 
 
 def case(function, label, call, *words, right=None):
@@ -188,7 +188,7 @@ PROBLEMS = [
         ("text as operator", lambda make=make: make("L"), ("laplacian", "'L'", "Operator")),
         ("a gradient as Laplacian", lambda make=make: make(gradient()), ("laplacian", "(2,)")),
         ("a condition", lambda make=make: make(laplacian(), conditions=js.dirichlet([0], 1.0)),
-         ("conditions", "Closure", "close")),
+         ("conditions", "Closure", "eliminate")),
         ("conditions of other points", lambda make=make: make(laplacian(), conditions=closure(20)),
          ("conditions", "20", "12")),
     )
@@ -337,19 +337,19 @@ REST = [
          ("spectral_radius = 0", "above 0")),
     )
 ] + [
-    case("upwinding", label, call, *words)
+    case("upwind_viscosity", label, call, *words)
     for label, call, words in (
-        ("an array as cloud", lambda: js.upwinding(np.ones((N, 2)), np.ones((N, 2))),
+        ("an array as cloud", lambda: js.upwind_viscosity(np.ones((N, 2)), np.ones((N, 2))),
          ("cloud", "(12, 2)", "PointCloud")),
-        ("velocity of other shape", lambda: js.upwinding(js.circle(N), np.ones((N, 3))),
+        ("velocity of other shape", lambda: js.upwind_viscosity(js.circle(N), np.ones((N, 3))),
          ("velocity", "(12, 3)", "(12, 2)")),
-        ("velocity a number", lambda: js.upwinding(js.circle(N), 1.0), ("velocity", "()")),
-        ("velocity NaN", lambda: js.upwinding(js.circle(N), np.full((N, 2), nan)),
+        ("velocity a number", lambda: js.upwind_viscosity(js.circle(N), 1.0), ("velocity", "()")),
+        ("velocity NaN", lambda: js.upwind_viscosity(js.circle(N), np.full((N, 2), nan)),
          ("velocity", "point 0")),
-        ("velocity text", lambda: js.upwinding(js.circle(N), "v"), ("velocity", "'v'")),
-        ("strength negative", lambda: js.upwinding(
+        ("velocity text", lambda: js.upwind_viscosity(js.circle(N), "v"), ("velocity", "'v'")),
+        ("strength negative", lambda: js.upwind_viscosity(
             js.circle(N), np.ones((N, 2)), strength=-1.0), ("strength = -1",)),
-        ("method as text", lambda: js.upwinding(
+        ("method as text", lambda: js.upwind_viscosity(
             js.circle(N), np.ones((N, 2)), method="DCPSE"), ("method", "'DCPSE'")),
     )
 ]  # fmt: skip

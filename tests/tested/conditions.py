@@ -30,7 +30,7 @@ TESTED = {
     "robin": _condition("value", "a", "b", "conormals"),
     "Condition": _condition("value", "a", "b", "conormals"),
     "free": _row("test_points_that_are_declared_free", {"field": _FREE}, _FREE, _FREE, _FREE),
-    "close": _row(
+    "eliminate": _row(
         "test_poisson_with_one_sided_stencils",
         dict.fromkeys(["points", "normals", "value", "a", "b", "conormals"], _GRAD),
         _GRAD,
@@ -49,7 +49,7 @@ TESTED = {
         _GHOSTS,
     ),
     "find_border": _row("test_conormals test_conormals_of_a_mesh", _ONLY, _ONLY, _ONLY),
-    "detect_border": _row("test_borders_are_detected", _ONLY, _ONLY, _ONLY),
+    "detect_boundary": _row("test_borders_are_detected", _ONLY, _ONLY, _ONLY),
     "Border": _row("test_conormals", dict.fromkeys(["points", "normals"], _NU), _NU, _VMAP),
     "border_conormals": _row(
         "test_conormals test_conormals_of_a_mesh",

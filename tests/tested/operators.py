@@ -79,7 +79,7 @@ TESTED = {
         "float32": _SIZES,
         "bad input": "malformed",
     },
-    "allocate": {
+    "allocate_search": {
         "value": "test_neighbors.py::test_capacity_exceeded_gives_both_numbers",
         "gradient": _INTEGERS,
         "jit": "test_neighbors.py::test_misuse_is_refused",

@@ -60,7 +60,7 @@ TESTED = {
         "test_solve_forms.py::test_single_precision",
         "bad input": "malformed",
     },
-    "Eigenmodes": {
+    "Modes": {
         "value": "test_eigen.py::test_groups_of_the_sphere",
         "gradient": _RESULT,
         "jit": _RESULT,
@@ -96,7 +96,7 @@ TESTED = {
         "float32": "test_precondition.py::test_cycle_is_linear_and_its_transpose_exact",
         "bad input": "malformed",
     },
-    "Multigrid": {
+    "VCycle": {
         "value": "test_precondition.py::test_cycle_is_linear_and_its_transpose_exact, "
         "test_renewal.py::test_at_the_same_weights_the_numbers_are_those_of_the_host",
         "gradient": "(not differentiated: derivatives of solve are implicit)",
@@ -113,7 +113,7 @@ TESTED = {
         "float32": _SOLVES + "test_single_precision",
         "bad input": "malformed",
     },
-    "Jacobi": {
+    "JacobiPreconditioner": {
         "value": "test_precondition.py::test_jacobi_is_the_diagonal",
         "gradient": "(not differentiated: derivatives of solve are implicit)",
         "jit": "test_steady.py::test_derivatives_with_conditions_and_jacobi",

@@ -153,7 +153,7 @@ TESTED: dict[str, dict[str, Entry]] = {
         "float32": _DAMPING,
         "bad input": "malformed",
     },
-    "upwinding": {
+    "upwind_viscosity": {
         "value": f"{_PDE}::test_damping_moves_all_eigenvalues_of_advection_to_the_left",
         "gradient": {
             "velocity": f"{_PDE}::test_upwinding_is_differentiable",

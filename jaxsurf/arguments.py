@@ -264,6 +264,24 @@ def is_array(x: Any) -> bool:
     return isinstance(x, jax.Array | np.ndarray)
 
 
+def more_digits(dtype: Any) -> str:
+    """The way to more digits than a precision has, where there is one."""
+    return "" if dtype == jnp.float64 else ": for more digits set jax_enable_x64"
+
+
+def within_round_off(rtol: Any, dtype: Any) -> None:
+    """Refuse a relative tolerance that is none, or that a precision cannot reach.
+
+    Raises:
+        TypeError, ValueError: with the least one there.
+    """
+    real(rtol, "rtol", above=0, below=1)
+    least = 4 * float(jnp.finfo(dtype).eps)
+    if is_concrete(rtol) and rtol < least:
+        need = f"{dtype} allows at least {least:.1e}"
+        raise ValueError(f"rtol = {float(rtol):g}, {need}{more_digits(dtype)}")
+
+
 def differentiable(f: Any, name: str, *arguments: jax.ShapeDtypeStruct) -> Any:
     """The shapes that a function returns, which must be one that JAX can trace.
 

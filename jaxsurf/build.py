@@ -166,6 +166,11 @@ def _adapted(cloud, method, throw, needed=True):
     """Neighbours that suit the method, and the Laplacian's weights and diagnostics with them."""
     cloud = without_derivatives(cloud)
     needs_values("cloud", cloud, instead="under jit and vmap pass the neighbours")
+    with at_once():  # also within something that is traced
+        return _chosen(cloud, method, throw, needed)
+
+
+def _chosen(cloud, method, throw, needed):
     on = cloud.host_active
     available = int(on.sum())
     k = min(method.neighbor_count(cloud.dim), available)

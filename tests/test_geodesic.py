@@ -150,6 +150,8 @@ def test_single_precision():
         single = js.PointCloud(jnp.asarray(points), jnp.asarray(normals))
         distance = js.geodesic_distance(single, np.array([125]))
         assert distance.dtype == jnp.float32
+        with pytest.raises(ValueError, match=r"allows at least 4\.8e-07: .*jax_enable_x64"):
+            js.geodesic_distance(single, np.array([125]), rtol=1e-12)
     assert relative_error(np.asarray(distance, float), exact) < 1e-4
 
 

@@ -19,6 +19,15 @@ each_method = pytest.mark.parametrize("method", METHODS, ids=label)
 each_kind = pytest.mark.parametrize("method", KINDS, ids=label)
 
 
+def test_what_is_known_is_built_at_once_in_compiled_code():
+    cloud = js.sphere(600)
+    z = cloud.points[:, 2]
+    apply = jax.jit(lambda u: js.laplace_beltrami(cloud)(u))
+    np.testing.assert_allclose(apply(z), js.laplace_beltrami(cloud)(z), atol=1e-9)
+    weights = jax.jit(lambda a: js.diffusion(cloud, a).weights)(1 + z**2)
+    np.testing.assert_allclose(weights, js.diffusion(cloud, 1 + z**2).weights, atol=1e-8)
+
+
 @each_method
 def test_constants_are_annihilated(method):
     neighbors = js.choose_neighbors(CLOUD, method=method)

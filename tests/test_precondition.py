@@ -13,7 +13,7 @@ from jaxsurf.solve.reduced import annihilates_constants, reduced_matrix, restric
 from jaxsurf.stencils.padded import PaddedMatrix
 from jaxsurf.stencils.stencil import prepared
 
-from .helpers import random_sphere
+from .helpers import count_compilations, random_sphere
 
 # Minutes in all.
 pytestmark = pytest.mark.slow
@@ -163,6 +163,16 @@ def test_bad_operators_are_refused():
         jax.jit(lambda w: js.multigrid(js.Stencil(laplacian.indices, w)).coarsest)(
             laplacian.weights
         )
+
+
+def test_cycles_at_the_prompt_compile_once():
+    laplacian = js.laplace_beltrami(js.sphere(600))
+    z, cycle = jnp.arange(600.0), js.multigrid(laplacian)
+    made = js.step_preconditioner(js.AdvectionDiffusionReaction(laplacian), z)
+    cycle(z), made(0.1).mv(z)
+    with count_compilations() as names:
+        cycle(z), made(0.1).mv(z)
+    assert not names, names
 
 
 def test_without_pyamg_the_extra_and_the_alternative_are_named(monkeypatch):

@@ -12,7 +12,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import instance, real
+from ..arguments import instance, within_round_off
 from ..build import choose_neighbors
 from ..cloud import PointCloud
 from ..compiling import at_once, sized_jit
@@ -103,7 +103,7 @@ def geodesic_distance(
     if cloud.active is not None:
         cloud, neighbors = cloud.seen, _own_in_padding(switched_on(cloud, neighbors))
     if rtol is not None:
-        real(rtol, "rtol", above=0, below=1)
+        within_round_off(rtol, cloud.points.dtype)
     else:
         rtol = float(jnp.finfo(cloud.points.dtype).eps) ** 0.6
 

@@ -13,7 +13,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ..arguments import as_float, finite, switched_off, whole
+from ..arguments import as_float, finite, more_digits, switched_off, whole
 from ..boundary import Closure
 from ..compiling import sized_jit
 from ..failures import is_concrete, refuse
@@ -134,8 +134,9 @@ def solve_nonlinear(
         raise RuntimeError(
             f"not solved: relative residual {float(solution.stats['relative_residual']):.1e} after "
             f"{int(solution.stats['num_steps'])} Newton steps, wanted rtol = {rtol:g}, atol = "
-            f"{atol:g}. The start may be far from a solution, or the system singular there; "
-            "throw=False returns what was reached"
+            f"{atol:g}. The start may be far from a solution, the system singular there, or the "
+            f"tolerance below the round-off of {u0.dtype}{more_digits(u0.dtype)}; throw=False "
+            "returns what was reached"
         )
     return solution
 

@@ -154,6 +154,10 @@ class VCycle(AbstractPreconditioner):
         return f"VCycle({sizes} unknowns, {self.coarsest.dtype.name}{where})"
 
     def __call__(self, r):
+        # At the prompt its loops would be compiled anew at every call.
+        return (_cycled if is_concrete(self, r) else VCycle._scaled)(self, r)
+
+    def _scaled(self, r):
         # The cycle is linear, so that a residual of any size can be brought to size one,
         # where single precision is safe.
         size = jnp.max(jnp.abs(r))
@@ -202,6 +206,9 @@ class VCycle(AbstractPreconditioner):
         """
         problem = renewal.check_renewal(self.plan, self.n, operator, conditions)
         return _renewed(*problem, bool(self.mean_zero), self.coarsest.dtype)
+
+
+_cycled = eqx.filter_jit(VCycle._scaled)
 
 
 class _Product(AbstractPreconditioner):

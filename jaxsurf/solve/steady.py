@@ -8,7 +8,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..arguments import as_float, count_on, finite, switched_off, whole
+from ..arguments import as_float, count_on, finite, more_digits, switched_off, whole
 from ..boundary import Closure
 from ..compiling import at_once, sized_jit
 from ..failures import is_concrete, needs_values, refuse, without_derivatives
@@ -241,10 +241,8 @@ def _raise_on_failure(solution, dtype, rtol, atol) -> None:
     if max(rtol, 0.05 * residual) < round_off:
         why = (
             "The system may be singular or indefinite, or the tolerance is below round-off: the "
-            f"rounding of the solution to {dtype} alone leaves {round_off:.1e}"
+            f"rounding of the solution to {dtype} alone leaves {round_off:.1e}{more_digits(dtype)}"
         )
-        if dtype == np.float32:
-            why += '. In double precision, jax.config.update("jax_enable_x64", True), it is less'
     raise RuntimeError(
         f"not solved{of}: relative residual {residual:.1e}{after}, wanted rtol = {rtol:g}, "
         f"atol = {atol:g}. {why}; throw=False returns what was reached"

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, PyTree
 
-from ..arguments import instance, real, whole
+from ..arguments import instance, real, whole, within_round_off
 from ..failures import is_concrete
 from ..functions import canonical, numbers_as_arrays
 from .asked import check_coefficients, check_saves, checked_rate, checked_state, checked_times
@@ -161,7 +161,8 @@ def planned(
     if isinstance(solver, RKC2):
         solver = _looped(solver, adjoint)
     if controller is None and dt0 is None:
-        _check_tolerances(rtol, atol, t0.dtype)
+        within_round_off(rtol, t0.dtype)
+        real(atol, "atol", least=0)
         shortest = _shortest(t0, t1)
         controller = dfx.PIDController(rtol, atol, dtmin=shortest, force_dtmin=False)
     elif controller is None:
@@ -239,15 +240,6 @@ def _looped(solver: RKC2, adjoint: dfx.AbstractAdjoint) -> RKC2:
     elif isinstance(adjoint, dfx.DirectAdjoint):
         loop = "bounded"
     return RKC2(solver.spectral_radius, solver.max_stages, loop)
-
-
-def _check_tolerances(rtol, atol, dtype) -> None:
-    least = 4 * float(jnp.finfo(dtype).eps)
-    real(rtol, "rtol", above=0, below=1)
-    real(atol, "atol", least=0)
-    if is_concrete(rtol) and rtol < least:
-        more = "" if dtype == jnp.float64 else ": for more digits set jax_enable_x64"
-        raise ValueError(f"rtol = {float(rtol):g}, {dtype} allows at least {least:.1e}{more}")
 
 
 def _shortest(t0: Array, t1: Array) -> Array:

@@ -12,7 +12,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import instance, within_round_off
+from ..arguments import instance, real, within_round_off
 from ..build import choose_neighbors
 from ..cloud import PointCloud
 from ..compiling import at_once, sized_jit

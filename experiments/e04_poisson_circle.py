@@ -28,7 +28,7 @@ def run(quick: bool, out: Path) -> list[Row]:
         theta = jnp.arctan2(cloud.points[:, 1], cloud.points[:, 0])
         start = int(jnp.argmin(jnp.linalg.norm(cloud.points - jnp.array([1.0, 0.0]), axis=1)))
         conditions = js.eliminate(cloud, js.dirichlet(np.array([start]), 0.0))
-        found = js.solve(laplacian, -4 * jnp.sin(2 * theta), conditions=conditions, rtol=1e-9)
+        found = js.solve(laplacian, -4 * jnp.sin(2 * theta), closure=conditions, rtol=1e-9)
         error = np.abs(np.asarray(found.value - jnp.sin(2 * theta)))
         largest.append(float(error.max()))
         typical.append(float(np.sqrt(np.mean(error**2))))

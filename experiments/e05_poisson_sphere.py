@@ -27,7 +27,7 @@ def solution_error(n: int, order: int, *, proportional: bool = False) -> tuple[n
     half = math.sqrt(4 * math.pi / n) / 2
     band = np.flatnonzero(np.abs(cloud.points[:, 0]) < half)
     conditions = js.eliminate(cloud, js.dirichlet(band, exact[band]))
-    found = js.solve(laplacian, -20 * exact, conditions=conditions, rtol=1e-10)
+    found = js.solve(laplacian, -20 * exact, closure=conditions, rtol=1e-10)
     return np.asarray(found.value - exact), int(found.stats["num_steps"])
 
 

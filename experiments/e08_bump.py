@@ -213,12 +213,12 @@ def diffuse(way: Discretisation, *, timed: bool = True, **how) -> Outcome:
         found = js.integrate(problem, u0, t1=_END, saveat=probes, args=args, **how)
         return jax.block_until_ready(found)
 
-    counted = _Counted(way.laplacian, conditions=way.closure)
+    counted = _Counted(way.laplacian, closure=way.closure)
     found = solve(counted, call)
     jax.effects_barrier()
     seconds = None
     if timed:
-        plain = js.AdvectionDiffusionReaction(way.laplacian, conditions=way.closure)
+        plain = js.AdvectionDiffusionReaction(way.laplacian, closure=way.closure)
         solve(plain)
         start = time.perf_counter()
         solve(plain)

@@ -94,7 +94,7 @@ def _scans(quick: bool) -> list[Row]:
         closure = (
             None if cloud.boundary is None else js.eliminate(cloud, js.neumann(cloud.boundary))
         )
-        found = js.solve(laplacian, f, conditions=closure, throw=False)
+        found = js.solve(laplacian, f, closure=closure, throw=False)
         setting = {"surface": make.__name__, "method": method_name(method), "n": cloud.n}
         residual = float(found.stats["relative_residual"])
         rows.append(Row("relative residual", residual, setting, None, "project", 1.5e-8))

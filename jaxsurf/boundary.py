@@ -275,7 +275,7 @@ def _filled(u, rows, indices, weights, given):
     return u.at[rows].set(values.astype(u.dtype), unique_indices=True)
 
 
-def check_border(operator: AbstractOperator, conditions: Closure | None) -> None:
+def check_border(operator: AbstractOperator, closure: Closure | None) -> None:
     """Refuse an operator on a surface with a border about which nothing is said.
 
     Without a condition its stencils there are one-sided, and what it is used for is not well
@@ -286,18 +286,18 @@ def check_border(operator: AbstractOperator, conditions: Closure | None) -> None
             out: a condition, or `free`.
     """
     border = operator.border
-    known = None if conditions is None else (conditions.declared, conditions.rows)
+    known = None if closure is None else (closure.declared, closure.rows)
     if border is None or not is_concrete(border, known):
         return
     left = np.array(border)
-    if conditions is not None:
-        as_many("conditions", conditions.n, "the operator", operator.n)
-        declared = conditions.bound if conditions.declared is None else conditions.declared
+    if closure is not None:
+        as_many("closure", closure.n, "the operator", operator.n)
+        declared = closure.bound if closure.declared is None else closure.declared
         left &= ~np.asarray(declared)
     raise_at(
         left,
         "point {i}{more} lies on the border and is under no condition, so that modes may grow "
-        "there without bound. Close the border, conditions=js.eliminate(cloud, [js.neumann(...), "
+        "there without bound. Close the border, closure=js.eliminate(cloud, [js.neumann(...), "
         "...]), or say that it is free: js.eliminate(cloud, js.free(cloud.boundary))",
     )
 

@@ -200,7 +200,7 @@ def run(
     with stage("operator"):
         laplacian = laplace_beltrami(cloud, method=method)
         neighbors = _lists(laplacian)
-        conditions = _held_at_border(cloud)
+        closure = _held_at_border(cloud)
     with stage("spectrum"):
         spectrum = spectral_estimate(_at_rest_on_border(laplacian))
     with stage("curvature"):
@@ -215,7 +215,7 @@ def run(
         # saves.
         value = jnp.asarray(surface.parameter[1], start.dtype)
         at = lambda value: _with_gradient(
-            value, start, surface.moved, neighbors, method, conditions, heat, jnp.asarray(probe)
+            value, start, surface.moved, neighbors, method, closure, heat, jnp.asarray(probe)
         )
         (_, temperature), (gradient, sensitivity) = at(value)
         step = 1e-4 * value
@@ -276,10 +276,10 @@ def save(demo: Demo, out: Path) -> list[Path]:
     return files
 
 
-def _temperature_at(value, start, moved, neighbors, method, conditions, heat, probe):
+def _temperature_at(value, start, moved, neighbors, method, closure, heat, probe):
     """Final temperature at the probe for a value of the surface's parameter; and all others."""
     laplacian = laplace_beltrami(moved(value), neighbors, method=method)
-    temperature = diffuse(laplacian, conditions, start, heat)
+    temperature = diffuse(laplacian, closure, start, heat)
     return temperature[-1, probe], temperature
 
 

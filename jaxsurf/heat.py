@@ -72,17 +72,17 @@ _STEPS, _MARGIN = 40, 1.2
 
 
 def diffuse(
-    laplacian: Stencil, conditions: Closure | None, start: Float[Array, " n"], heat: Heat
+    laplacian: Stencil, closure: Closure | None, start: Float[Array, " n"], heat: Heat
 ) -> Float[Array, "frames n"]:
     r"""Temperatures $u_t = \Delta_S u$ at the frames; borders keep theirs.
 
     Differentiable in the operator and the start.
     """
-    if conditions is not None:
-        held = start[conditions.rows]
-        conditions = eqx.tree_at(lambda c: c.sources[0].condition.value, conditions, held)
+    if closure is not None:
+        held = start[closure.rows]
+        closure = eqx.tree_at(lambda c: c.sources[0].condition.value, closure, held)
     return integrate(
-        AdvectionDiffusionReaction(laplacian, conditions=conditions),
+        AdvectionDiffusionReaction(laplacian, closure=closure),
         start,
         t1=heat.until,
         solver=RKC2(spectral_radius=heat.radius),

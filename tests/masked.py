@@ -392,14 +392,14 @@ def closed(c: Case):
         "values": closure(c.u)[c.rows],
         "linear": closure.homogeneous(c.u)[c.rows],
         "offset": closure.offset(),
-        "solved": js.solve(screened(c), c.u, conditions=closure, rtol=1e-11).value,
-        "jacobi": js.jacobi(screened(c), conditions=closure)(u),
+        "solved": js.solve(screened(c), c.u, closure=closure, rtol=1e-11).value,
+        "jacobi": js.jacobi(screened(c), closure=closure)(u),
         "in time": evolved(
             c,
-            js.AdvectionDiffusionReaction(c.laplacian, conditions=closure),
+            js.AdvectionDiffusionReaction(c.laplacian, closure=closure),
             solver=js.IMEX(order=2),
         ),
-        "modes": modes(c, conditions=closure)[:2],
+        "modes": modes(c, closure=closure)[:2],
     }
 
 
@@ -409,7 +409,7 @@ def mirrored(c: Case):
     ghosts = slice(c.cloud.n, None)
     operator = 1 - js.laplace_beltrami(wide, method=METHOD)
     rhs = closure.extend(c.u)
-    found = js.solve(operator, rhs, conditions=closure, rtol=1e-11).value
+    found = js.solve(operator, rhs, closure=closure, rtol=1e-11).value
     return {
         "ghosts": wide.points[ghosts],
         "values": rhs[ghosts],

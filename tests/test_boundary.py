@@ -268,7 +268,7 @@ def test_a_border_about_which_nothing_is_said():
             check_border(operator, None)
         with pytest.raises(ValueError, match=words):
             check_border(operator, js.eliminate(cloud, js.dirichlet(np.flatnonzero(border)[:3])))
-    with pytest.raises(ValueError, match="conditions of 81 points, the operator has 49"):
+    with pytest.raises(ValueError, match="closure of 81 points, the operator has 49"):
         small = square(7)
         check_border(
             js.laplace_beltrami(small, method=method), js.eliminate(cloud, js.free(border))

@@ -85,7 +85,7 @@ def test_dirichlet_conditions():
     bound = jnp.arange(len(points)) >= len(points) - 200
     cloud = js.PointCloud(points, points, boundary=bound)
     conditions = js.eliminate(cloud, [js.dirichlet(bound)])
-    modes = js.eigenmodes(js.laplace_beltrami(cloud), 6, conditions=conditions)
+    modes = js.eigenmodes(js.laplace_beltrami(cloud), 6, closure=conditions)
     np.testing.assert_allclose(modes.values, [2, 6, 6, 12, 12, 12], rtol=2e-2)
     assert jnp.abs(modes.functions[bound]).max() == 0
     z = cloud.points[:, 2]
@@ -180,7 +180,7 @@ def test_derivative_in_the_conditions():
 
     def value(weights):
         conditions = eqx.tree_at(lambda c: c.weights, closure, weights)
-        modes = js.eigenmodes(operator, 2, conditions=conditions)
+        modes = js.eigenmodes(operator, 2, closure=conditions)
         return modes.values[0] + jnp.mean(modes.functions[:, 1] ** 4)
 
     check_derivative(value, closure.weights, step=1e-4)

@@ -47,9 +47,7 @@ def test_conditions_hold(problem):
     cap = z > 0.8
     conditions = js.eliminate(cloud, js.dirichlet(cap, z[cap]))
     rhs = 3 * z + z**3
-    found = js.solve_nonlinear(
-        operator, lambda u, _: u + u**3, 0 * z, rhs=rhs, conditions=conditions
-    )
+    found = js.solve_nonlinear(operator, lambda u, _: u + u**3, 0 * z, rhs=rhs, closure=conditions)
     assert float(jnp.abs(found.value - z)[cap].max()) < 1e-14
     assert float(jnp.abs(found.value - z).max()) < 2e-3
 

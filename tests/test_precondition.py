@@ -110,7 +110,7 @@ def test_jacobi_is_the_diagonal():
     np.testing.assert_allclose(js.jacobi(operator).divisor, diagonal, rtol=1e-12)
     bound = jnp.arange(300) < 10
     conditions = js.eliminate(cloud, js.dirichlet(bound, 0.0))
-    with_conditions = js.jacobi(operator, conditions=conditions).divisor
+    with_conditions = js.jacobi(operator, closure=conditions).divisor
     np.testing.assert_allclose(with_conditions, jnp.where(bound, 1, diagonal), rtol=1e-12)
     with pytest.raises(ValueError, match="Composition"):
         js.jacobi(operator @ operator)
@@ -121,7 +121,7 @@ def test_constants_are_recognised():
     laplacian = js.laplace_beltrami(cloud)
     pinned = js.eliminate(cloud, js.dirichlet(np.array([3]), 1.0))
 
-    def singular(operator, conditions=None):
+    def singular(operator, closure=None):
         matrix = reduced_matrix(operator, conditions)
         free = restriction_of(operator, conditions).on_host
         return annihilates_constants(matrix, free)
@@ -142,7 +142,7 @@ def test_separate_parts_are_singular_and_named():
     # A value on one of them leaves the other.
     pinned = js.eliminate(two, js.dirichlet(np.array([0]), 0.0))
     with pytest.raises(ValueError, match=r"300 points around point 300"):
-        js.multigrid(laplacian, conditions=pinned)
+        js.multigrid(laplacian, closure=pinned)
 
 
 def test_bad_operators_are_refused():

@@ -58,8 +58,8 @@ def test_at_the_same_weights_the_numbers_are_those_of_the_host(kind):
     if kind == "masked":
         operator = js.laplace_beltrami(cloud, method=SURFACE.method)
     conditions = js.eliminate(CLOUD, BAND) if kind == "dirichlet" else None
-    host = js.multigrid(operator, conditions=conditions, renewable=True)
-    renewed = host.renewed(operator, conditions=conditions)
+    host = js.multigrid(operator, closure=conditions, renewable=True)
+    renewed = host.renewed(operator, closure=conditions)
     assert renewed.sizes == host.sizes and len(host.levels) == 2
     for a, b in zip(host.levels, renewed.levels):
         assert_same(a.inverse, b.inverse)
@@ -85,15 +85,15 @@ def test_steps_are_those_of_a_hierarchy_made_anew(method, closed):
     k = method.neighbor_count(3)
     first = js.laplace_beltrami(CLOUD, js.find_neighbors(CLOUD, k=k), method=method)
     conditions = None if closed else js.eliminate(CLOUD, BAND)
-    cycle = js.multigrid(first, conditions=conditions, renewable=True)
+    cycle = js.multigrid(first, closure=conditions, renewable=True)
 
     def steps(preconditioner, operator):
-        options = {"conditions": conditions, "project": True, "preconditioner": preconditioner}
+        options = {"closure": conditions, "project": True, "preconditioner": preconditioner}
         return js.solve(operator, F, **options).stats["num_steps"]
 
     @jax.jit
     def with_renewed(operator):
-        return steps(cycle.renewed(operator, conditions=conditions), operator)
+        return steps(cycle.renewed(operator, closure=conditions), operator)
 
     with_renewed(first)
     for t in (0.5, 1.0):
@@ -104,7 +104,7 @@ def test_steps_are_those_of_a_hierarchy_made_anew(method, closed):
         with count_compilations() as names:
             count = int(with_renewed(operator))
         assert not names, names
-        anew = js.multigrid(operator, conditions=conditions)
+        anew = js.multigrid(operator, closure=conditions)
         assert count <= 1.3 * int(steps(anew, operator))
 
 
@@ -134,7 +134,7 @@ def test_derivatives_in_points_through_compiled_solves(given):
 def test_aggregates_found_by_neighbours_serve_as_well(kind):
     surface = js.discretize(CLOUD, method=js.GFDM(degree=4))
     conditions = js.eliminate(CLOUD, BAND) if kind == "dirichlet" else None
-    options = {"project": True, "conditions": conditions, "mean_zero": kind == "closed"}
+    options = {"project": True, "closure": conditions, "mean_zero": kind == "closed"}
 
     def solution(t):
         laplacian = surface.moved(twisted(t)).laplacian
@@ -179,8 +179,8 @@ def test_sums_and_compositions():
 def test_hierarchies_for_all_steps(closed):
     laplacian = SURFACE.laplacian
     conditions = None if closed else js.eliminate(CLOUD, BAND)
-    host = shifted.shifted_multigrid(laplacian, conditions=conditions, renewable=True)
-    renewed = host.renewed(laplacian, conditions=conditions)
+    host = shifted.shifted_multigrid(laplacian, closure=conditions, renewable=True)
+    renewed = host.renewed(laplacian, closure=conditions)
     assert len(host.pairs) == 2
     for a, b in zip(host.pairs, renewed.pairs):
         for name in ("mass_diagonal", "stiff_diagonal", "radius"):

@@ -152,7 +152,7 @@ POINTWISE = {
     "eliminate": (lambda p: p.conditions(smooth(p.cloud.points) * p.u), [EVEN, *UNEVEN], 1e-12),
     "solve": (
         lambda p: (
-            js.solve(p.laplacian, smooth(p.cloud.points), conditions=p.conditions, rtol=1e-12).value
+            js.solve(p.laplacian, smooth(p.cloud.points), closure=p.conditions, rtol=1e-12).value
         ),
         [EVEN],
         1e-10,
@@ -180,7 +180,7 @@ VALUES = {
         1e-9,
     ),
     "eigenmodes": (
-        lambda p: js.eigenmodes(p.laplacian, 6, conditions=p.conditions).values,
+        lambda p: js.eigenmodes(p.laplacian, 6, closure=p.conditions).values,
         [EVEN],
         1e-10,
     ),

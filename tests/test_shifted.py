@@ -21,7 +21,7 @@ NOISE = jnp.asarray(np.random.default_rng(0).normal(size=CLOUD.n))
 @pytest.mark.parametrize("closed", [True, False])
 def test_cycles_reduce_the_residual_for_every_step(closed):
     conditions = None if closed else js.eliminate(CLOUD, js.dirichlet(jnp.abs(Z) < 0.1, 0.0))
-    hierarchy = shifted_multigrid(LAPLACIAN, conditions=conditions)
+    hierarchy = shifted_multigrid(LAPLACIAN, closure=conditions)
 
     @jax.jit
     def residual_after(g, cycles: int = 4):

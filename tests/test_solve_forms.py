@@ -60,7 +60,7 @@ def test_modes_of_another_operator_compile_nothing():
 
     def programs(operator, closure=None):
         with count_compilations() as names:
-            js.eigenmodes(operator, 4, conditions=closure)
+            js.eigenmodes(operator, 4, closure=closure)
         return names
 
     first = programs(operators[0])
@@ -119,14 +119,14 @@ def test_solve_with_images(mirrored):
     cloud, operator, closure, exact, _ = mirrored
     screened = 1 - operator
     rhs = (1 + 5 * np.pi**2 / 4) * exact
-    found = js.solve(screened, rhs, conditions=closure)
+    found = js.solve(screened, rhs, closure=closure)
     error = jnp.linalg.norm((found.value - exact)[: cloud.n]) / jnp.linalg.norm(exact[: cloud.n])
     assert error < 0.05
 
 
 def test_modes_with_images(mirrored):
     cloud, operator, closure, _, exact = mirrored
-    modes = js.eigenmodes(operator, 4, conditions=closure)
+    modes = js.eigenmodes(operator, 4, closure=closure)
     np.testing.assert_allclose(modes.values, exact, rtol=0.06, atol=1e-8)
     assert modes.imaginary.max() < 1e-8
     if exact[0] > 0:

@@ -88,14 +88,14 @@ def test_conditions_are_met_and_equations_hold_elsewhere(sphere):
     z = cloud.points[:, 2]
     band = np.flatnonzero(np.abs(z) < 0.05)
     conditions = js.eliminate(cloud, js.dirichlet(band, z[band] + 1.0))
-    found = js.solve(laplacian, -2 * z, conditions=conditions)
+    found = js.solve(laplacian, -2 * z, closure=conditions)
     assert float(jnp.abs(found.value - z - 1)[band].max()) < 1e-14
     assert float(jnp.abs(found.value - z - 1).max()) < 2e-3
     free = ~np.asarray(conditions.bound)
     left = (laplacian(found.value) + 2 * z)[free]
     assert float(jnp.linalg.norm(left)) < 1e-7 * float(jnp.linalg.norm(z))
     # Values of the right-hand side at bound points do not count.
-    again = js.solve(laplacian, (-2 * z).at[band].set(1e3), conditions=conditions)
+    again = js.solve(laplacian, (-2 * z).at[band].set(1e3), closure=conditions)
     np.testing.assert_allclose(again.value, found.value, atol=1e-9)
 
 
@@ -170,8 +170,8 @@ def test_derivatives_with_conditions_and_jacobi(sphere):
         conditions = js.eliminate(cloud, js.dirichlet(cap, values))
         moved = eqx.tree_at(lambda o: o.weights, operator, weights)
         found = js.solve(
-            moved, f, conditions=conditions, mean_zero=False, rtol=1e-13,
-            preconditioner=js.jacobi(moved, conditions=conditions),
+            moved, f, closure=conditions, mean_zero=False, rtol=1e-13,
+            preconditioner=js.jacobi(moved, closure=conditions),
         )  # fmt: skip
         return jnp.sum(found.value**3)
 
@@ -190,25 +190,25 @@ def test_the_transposed_system_with_flux_conditions():
     conormals = conormals / jnp.linalg.norm(conormals, axis=1, keepdims=True)
     conditions = js.eliminate(patch, js.neumann(border, 0.0, conormals=conormals))
     laplacian = js.laplace_beltrami(patch, throw=False)
-    preconditioner = js.multigrid(laplacian, conditions=conditions)
+    preconditioner = js.multigrid(laplacian, closure=conditions)
     assert preconditioner.mean_zero
     system = System.of(laplacian, conditions, jnp.float64, True)
     u, v = jnp.asarray(np.random.default_rng(0).normal(size=(2, patch.n)))
     one, other = jnp.vdot(v, system.matrix @ u), jnp.vdot(system.matrix.T @ v, u)
     np.testing.assert_allclose(one, other, rtol=1e-11)
-    inverse = system.inverse(js.multigrid(laplacian, conditions=conditions, single=False))
+    inverse = system.inverse(js.multigrid(laplacian, closure=conditions, single=False))
     one, other = jnp.vdot(v, inverse @ u), jnp.vdot(inverse.T @ v, u)
     np.testing.assert_allclose(one, other, rtol=1e-11)
 
     found = js.solve(
-        laplacian, points[:, 0], conditions=conditions, preconditioner=preconditioner, project=True
+        laplacian, points[:, 0], closure=conditions, preconditioner=preconditioner, project=True
     )
     assert abs(float(jnp.mean(found.value))) < 1e-13
     total = lambda f: jnp.sum(
         js.solve(
             laplacian,
             f,
-            conditions=conditions,
+            closure=conditions,
             preconditioner=preconditioner,
             rtol=1e-12,
             project=True,

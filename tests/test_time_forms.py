@@ -25,7 +25,7 @@ WAVE = jnp.exp(0.5 * X) - 1
 class Drift(js.AbstractEvolution):
     """A problem of one's own: diffusion, and a reaction that pulls towards the values ±1."""
 
-    conditions: None
+    closure: None
     laplacian: js.AbstractOperator
     pull: jax.Array
 

@@ -20,7 +20,7 @@ GROWTH, DIFFUSIVITY, END = 0.5, 0.3, 0.2
 class Grown(js.AbstractEvolution):
     r"""Heat that is carried and diluted by a surface that grows, $\dot x = a x$."""
 
-    conditions: None
+    closure: None
     surface: js.Discretization
     laplacian: js.AbstractOperator | None
     growth: jax.Array

@@ -188,7 +188,7 @@ def test_conditions():
     near = jnp.abs(z) < 0.1
     laplacian = js.laplace_beltrami(cloud)
     closure = js.eliminate(cloud, [js.dirichlet(near, lambda t: jnp.exp(-2 * t) * z[near])])
-    problem = js.AdvectionDiffusionReaction(laplacian, conditions=closure)
+    problem = js.AdvectionDiffusionReaction(laplacian, closure=closure)
     for solver in (js.RKC2(), js.IMEX(order=3), js.SDIRK(order=3)):
         u = js.integrate(problem, z, t1=0.5, solver=solver, rtol=1e-6, atol=1e-7).ys[-1]
         np.testing.assert_array_equal(u[near], closure(u, 0.5)[near])
@@ -201,7 +201,7 @@ def test_wave_conditions_bind_the_velocity_too():
     near = jnp.abs(Z) < 0.1
     omega = np.sqrt(2.0)
     closure = js.eliminate(CLOUD, [js.dirichlet(near, lambda t: jnp.cos(omega * t) * Z[near])])
-    problem = js.WaveEquation(LAPLACIAN, conditions=closure)
+    problem = js.WaveEquation(LAPLACIAN, closure=closure)
     value, velocity = js.integrate(problem, (Z, 0 * Z), t1=1.0, rtol=1e-7, atol=1e-8).ys
     assert float(jnp.abs(value[-1] - np.cos(omega) * Z).max()) < 2e-3
     assert float(jnp.abs(velocity[-1] + omega * np.sin(omega) * Z).max()) < 5e-3
@@ -327,7 +327,7 @@ def test_heat_under_flux_conditions(kind, ghosts):
     else:
         wide, closure = cloud, js.eliminate(cloud, [flux, rest], method=method)
     problem = js.AdvectionDiffusionReaction(
-        js.laplace_beltrami(wide, method=method), conditions=closure
+        js.laplace_beltrami(wide, method=method), closure=closure
     )
     u0 = closure.extend(wave(a * x)) if ghosts else wave(a * x)
     solution = js.integrate(problem, u0, t1=0.2, rtol=1e-5, atol=1e-7)
@@ -342,7 +342,7 @@ def test_heat_under_flux_conditions(kind, ghosts):
 class Swing(js.AbstractEvolution):
     """A pair of fields that turn into each other, stiffly damped: a problem of one's own."""
 
-    conditions: None
+    closure: None
     laplacian: js.Stencil
     speed: float
 

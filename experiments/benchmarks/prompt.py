@@ -156,7 +156,7 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
     "solve, Dirichlet": (
         "open",
         "laplacian closure",
-        lambda m: js.solve(m.laplacian, m.u, conditions=m.closure).value,
+        lambda m: js.solve(m.laplacian, m.u, closure=m.closure).value,
     ),
     "eliminate": ("open", "conditions", lambda m: js.eliminate(m.cloud, m.conditions)),
     "with_ghosts": ("open", "", lambda m: js.with_ghosts(m.cloud, js.neumann(m.cloud.boundary))),

@@ -59,7 +59,7 @@ def eigenmodes(
     operator: AbstractOperator,
     k: int,
     *,
-    conditions: Closure | None = None,
+    closure: Closure | None = None,
     degenerate: float = 1e-3,
 ) -> Modes:
     r"""The lowest k modes of minus an operator, as a rule the Laplace–Beltrami operator.
@@ -77,7 +77,7 @@ def eigenmodes(
             few close to zero.
         k: number of modes, the constants of a closed surface counted. A group cut off by k
             has neither a symmetric function nor a whole basis: see `groups`.
-        conditions: from `eliminate`; their homogeneous part defines the modes. Closed surfaces,
+        closure: from `eliminate`; their homogeneous part defines the modes. Closed surfaces,
             and borders that the operator itself provides for, need none.
         degenerate: relative distance of neighbouring values within a group.
 
@@ -104,19 +104,19 @@ def eigenmodes(
     """
     instance(operator, AbstractOperator, "operator", "js.laplace_beltrami(cloud) makes one")
     check_scalar(operator)
-    if conditions is not None:
-        instance(conditions, Closure, "conditions", "js.eliminate(cloud, conditions) makes one")
-    check_border(operator, conditions)
+    if closure is not None:
+        instance(closure, Closure, "closure", "js.eliminate(cloud, conditions) makes one")
+    check_border(operator, closure)
     k, degenerate = whole(k, "k"), float(real(degenerate, "degenerate", least=0, below=1))
     n = operator.n
     if is_concrete(operator.active):
         n = int(count_on(operator.active, n))
     if not 1 <= k <= n // 2:
         raise ValueError(f"k = {k} modes, between 1 and n / 2 = {n // 2} can be computed")
-    system = _System.of(operator, conditions)
+    system = _System.of(operator, closure)
     values, functions, *others = _modes(system, k, degenerate)
-    if conditions is not None:
-        functions = conditions.homogeneous(functions)
+    if closure is not None:
+        functions = closure.homogeneous(functions)
     return Modes(values, functions, *others)
 
 
@@ -127,12 +127,12 @@ class _System(eqx.Module):
     free: Bool[Array, " n"]
 
     @staticmethod
-    def of(operator: AbstractOperator, conditions: Closure | None) -> _System:
-        if conditions is None:
+    def of(operator: AbstractOperator, closure: Closure | None) -> _System:
+        if closure is None:
             on = operator.active
             return _System(operator, jnp.ones(operator.n, bool) if on is None else on)
-        free = switched_off(operator.active, _free(conditions))
-        return _System(conditions.reduce(operator), free)
+        free = switched_off(operator.active, _free(closure))
+        return _System(closure.reduce(operator), free)
 
     def __call__(self, fields: Float[Array, "n c"]) -> Float[Array, "n c"]:
         return -self.operator(fields)
@@ -144,8 +144,8 @@ class _System(eqx.Module):
 
 
 @eqx.filter_jit
-def _free(conditions: Closure) -> Bool[Array, " n"]:
-    return ~conditions.bound
+def _free(closure: Closure) -> Bool[Array, " n"]:
+    return ~closure.bound
 
 
 # --- the rule -------------------------------------------------------------------------------

@@ -120,14 +120,14 @@ def geodesic_distance(
     surface = Discretization(cloud, neighbors, method)
     plain = (surface.laplacian.weights, surface.gradient.weights)
     scale = np.asarray(smoothing, cloud.points.dtype)
-    return _distances(
-        cloud.points, cloud.normals, neighbors, plain, path, known, inverse, scale, rtol
-    )
+    place = cloud.points, cloud.normals
+    return _distances(place, neighbors, plain, path, known, inverse, scale, rtol)
 
 
 @sized_jit
-def _distances(points, normals, neighbors, plain, path, known, inverse, smoothing, rtol):
+def _distances(place, neighbors, plain, path, known, inverse, smoothing, rtol):
     """All that is done on the device, in one program; rtol is static."""
+    points, normals = place
     share, fixed, near, owners, sources, off = known
     indices = neighbors.indices.T
     spacing = smoothing * _spacing(points, neighbors)
@@ -150,7 +150,7 @@ def _distances(points, normals, neighbors, plain, path, known, inverse, smoothin
     from_others = _unit(Stencil(indices, others)(direction))
     direction = jnp.where(replaced[:, None], from_others, direction).at[near].set(away)
     value = jnp.zeros_like(path).at[near].set(distance)
-    return _integrate(points, normals, indices, share, direction, fixed, value, inverse, rtol)
+    return _integrate(place, (indices, share, fixed), direction, value, inverse, rtol)
 
 
 def _random_walk(points, indices, share):
@@ -248,8 +248,9 @@ def _preconditioner(indices, share, fixed, differentiated: bool):
     return jax.device_put(multigrid(operator)), operator.prepared.table if differentiated else None
 
 
-def _integrate(x, normals, indices, share, direction, fixed, value, inverse, rtol):
+def _integrate(place, differences, direction, value, inverse, rtol):
     """The field whose differences fit the directions and which has given values near sources."""
+    (x, normals), (indices, share, fixed) = place, differences
 
     def add_slot(total, slot):
         j, w = slot

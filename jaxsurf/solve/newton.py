@@ -41,7 +41,7 @@ def solve_nonlinear(
     *,
     args: Any = None,
     rhs: Float[Array, " n"] | float = 0.0,
-    conditions: Closure | None = None,
+    closure: Closure | None = None,
     preconditioner: AbstractPreconditioner | None = None,
     solver: lx.AbstractLinearSolver | None = None,
     rtol: float | None = None,
@@ -61,7 +61,7 @@ def solve_nonlinear(
         u0: where to start, `(n,)`.
         args: parameters of the reaction, any pytree; derivatives in them need them here.
         rhs: f, `(n,)` or a number.
-        conditions: from `js.eliminate` or `js.with_ghosts`.
+        closure: from `js.eliminate` or `js.with_ghosts`.
         preconditioner: for $L + r'$; `js.multigrid` of it at u0 if None, under
             `jit` and `vmap` where the neighbours are concrete. One serves all steps.
         solver: of the linear systems; `js.BiCGStab` if None, loosely but for derivatives.
@@ -93,7 +93,7 @@ def solve_nonlinear(
         >>> bool(jnp.abs(u - z).max() < 0.01)
         True
     """
-    check_system(operator, conditions, preconditioner, solver, atol)
+    check_system(operator, closure, preconditioner, solver, atol)
     if not callable(reaction):
         raise TypeError(f"reaction is a {type(reaction).__name__}, expected a function (u, args)")
     whole(max_steps, "max_steps", least=1)
@@ -113,10 +113,10 @@ def solve_nonlinear(
     # Programs and arrays: other numbers, or the same code in a new lambda, compile nothing.
     args = numbers_as_arrays(args)
     reaction = canonical(reaction, u0, args)
-    problem = _Problem(operator, conditions, reaction, args, rhs)
+    problem = _Problem(operator, closure, reaction, args, rhs)
     if preconditioner is None:
         linearized = operator + problem.slope(u0)
-        preconditioner = multigrid(linearized, conditions=conditions, mean_zero=False)
+        preconditioner = multigrid(linearized, closure=closure, mean_zero=False)
     if preconditioner.mean_zero:
         raise ValueError(
             "singular at u0: the operator annihilates the constants and the reaction has slope "
@@ -125,11 +125,11 @@ def solve_nonlinear(
     concrete = is_concrete(problem, u0, preconditioner)
     if not concrete:  # nothing concrete is differentiated
         problem = eqx.tree_at(lambda p: p.operator, problem, prepared(operator))
-    numbers = np.asarray(rtol), np.asarray(float(atol)), np.asarray(max_steps)
+    limits = np.asarray(rtol), np.asarray(float(atol)), np.asarray(max_steps)
     solver = None if solver is None else tolerances_as_arrays(solver)
     # Errors of concrete problems are raised here: they share one program, whatever `throw` is.
     flags = concrete, throw and not concrete
-    solution = _solve(problem, u0, preconditioner, solver, *numbers, *flags)
+    solution = _solve(problem, u0, preconditioner, solver, limits, *flags)
     if throw and concrete and bool(solution.result != optx.RESULTS.successful):
         raise RuntimeError(
             f"not solved: relative residual {float(solution.stats['relative_residual']):.1e} after "
@@ -143,20 +143,20 @@ def solve_nonlinear(
 
 class _Problem(eqx.Module):
     operator: AbstractOperator
-    conditions: Closure | None
+    closure: Closure | None
     reaction: Reaction
     args: Any
     rhs: Array
 
     def field(self, v):
-        return v if self.conditions is None else self.conditions(v)
+        return v if self.closure is None else self.closure(v)
 
     def residual(self, v):
         """P (f - L u - r(u)) at u = E v + e."""
         u = self.field(v)
         left = self.rhs - self.operator(u) - self.reaction(u, self.args)
         left = switched_off(self.operator.active, left)
-        return left if self.conditions is None else self.conditions.restrict(left)
+        return left if self.closure is None else self.closure.restrict(left)
 
     def slope(self, v):
         """r'(u)."""
@@ -168,7 +168,7 @@ class _Problem(eqx.Module):
         """The solution of (L + r') delta = residual; what it is linearised at is a constant."""
         fixed, v = constant((self, v))
         slope = _Slope(fixed.reaction, fixed.args, fixed.field(v))
-        system = System(fixed.operator + Map(slope, len(v)), fixed.conditions)
+        system = System(fixed.operator + Map(slope, len(v)), fixed.closure)
         return solve_system(system.matrix, residual, solver, constant(preconditioner))
 
 
@@ -182,7 +182,8 @@ class _State(eqx.Module):
 
 
 @sized_jit
-def _solve(problem, u0, preconditioner, solver, rtol, atol, max_steps, concrete, throw):
+def _solve(problem, u0, preconditioner, solver, limits, concrete, throw):
+    rtol, atol, max_steps = limits
     fixed = constant(problem)
     loose = BiCGStab(_FORCING, 0.0, 1000) if solver is None else solver
     start = fixed.residual(jax.lax.stop_gradient(u0))

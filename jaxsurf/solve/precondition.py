@@ -176,17 +176,17 @@ class VCycle(AbstractPreconditioner):
     def transpose(self):
         return VCycle(self.mean_zero, tuple(v.T for v in self.levels), self.coarsest.T)
 
-    def renewed(self, operator: AbstractOperator, *, conditions: Closure | None = None) -> VCycle:
+    def renewed(self, operator: AbstractOperator, *, closure: Closure | None = None) -> VCycle:
         r"""The hierarchy of another operator on the same points: same aggregates, other numbers.
 
-        Runs under `jit`, `vmap` and `grad`, for traced weights and neighbours, conditions and
+        Runs under `jit`, `vmap` and `grad`, for traced weights and neighbours, closure and
         masks; other values compile nothing. A constant for derivatives. Where neighbours are
         not those of the first operator, entries that its patterns do not hold are lumped.
 
         Args:
             operator: scalar; one of which the diagonal is known. It annihilates the constants if
                 the first one did.
-            conditions: from `js.eliminate` or `js.with_ghosts`; if there were some at first.
+            closure: from `js.eliminate` or `js.with_ghosts`; if there were some at first.
 
         Raises:
             TypeError: what is no operator or closure.
@@ -204,7 +204,7 @@ class VCycle(AbstractPreconditioner):
             >>> bool(jnp.allclose(solved(2.0), solved(1.0) / 2))
             True
         """
-        problem = renewal.check_renewal(self.plan, self.n, operator, conditions)
+        problem = renewal.check_renewal(self.plan, self.n, operator, closure)
         return _renewed(*problem, bool(self.mean_zero), self.coarsest.dtype)
 
 
@@ -225,16 +225,14 @@ class _Product(AbstractPreconditioner):
     def transpose(self):
         return _Product(self.mean_zero, self.inner.T, self.outer.T)
 
-    def renewed(self, operator, *, conditions=None):
+    def renewed(self, operator, *, closure=None):
         instance(operator, Composition, "operator", "as the hierarchy was made for")
         pairs = (self.outer, operator.outer), (self.inner, operator.inner)
-        both = (p.renewed(o, conditions=conditions) for p, o in pairs)
+        both = (p.renewed(o, closure=closure) for p, o in pairs)
         return _Product(self.mean_zero, *both)
 
 
-def jacobi(
-    operator: AbstractOperator, *, conditions: Closure | None = None
-) -> JacobiPreconditioner:
+def jacobi(operator: AbstractOperator, *, closure: Closure | None = None) -> JacobiPreconditioner:
     r"""The diagonal of an operator as a preconditioner.
 
     Needs no optional package and no concrete arrays, but takes of the order of $1/h$ steps:
@@ -242,7 +240,7 @@ def jacobi(
 
     Args:
         operator: a stencil from scalar fields to scalar fields; may be traced.
-        conditions: from `js.eliminate` or `js.with_ghosts`.
+        closure: from `js.eliminate` or `js.with_ghosts`.
 
     Returns:
         To be passed to `js.solve`.
@@ -255,18 +253,18 @@ def jacobi(
         >>> bool((js.jacobi(screened).divisor > 0).all())
         True
     """
-    check_kinds(operator, conditions)
+    check_kinds(operator, closure)
     diagonal = operator.diagonal
     diagonal = switched_off(operator.active, diagonal, 1)
-    if conditions is not None:
-        diagonal = jnp.where(conditions.bound, 1, diagonal)
+    if closure is not None:
+        diagonal = jnp.where(closure.bound, 1, diagonal)
     return JacobiPreconditioner(None, jax.lax.stop_gradient(diagonal))
 
 
 def multigrid(
     operator: AbstractOperator,
     *,
-    conditions: Closure | None = None,
+    closure: Closure | None = None,
     single: bool = True,
     renewable: bool = False,
     mean_zero: bool | None = None,
@@ -284,7 +282,7 @@ def multigrid(
     Args:
         operator: scalar, with concrete neighbours. For an indefinite Helmholtz operator
             $\Delta + \kappa^2$ pass $\Delta - \kappa^2$ here.
-        conditions: from `js.eliminate` or `js.with_ghosts`; the same as for `js.solve`.
+        closure: from `js.eliminate` or `js.with_ghosts`; the same as for `js.solve`.
         single: hold and run the cycle in single precision, which halves its time. The solution
             is not affected: its residual is computed in the precision of the operator.
         renewable: keep what `VCycle.renewed` needs to serve other weights in compiled code.
@@ -305,25 +303,25 @@ def multigrid(
         >>> len(js.multigrid(laplacian).levels)
         1
     """
-    check_kinds(operator, conditions)
-    if isinstance(operator, Composition) and conditions is None:
+    check_kinds(operator, closure)
+    if isinstance(operator, Composition) and closure is None:
         make = lambda o: multigrid(o, single=single, renewable=renewable, mean_zero=mean_zero)
         outer, inner = make(operator.outer), make(operator.inner)
         return _Product(bool(outer.mean_zero or inner.mean_zero), outer, inner)
-    known = without_derivatives((operator, conditions))
+    known = without_derivatives((operator, closure))
     if is_concrete(known):
-        return _hierarchy(operator, conditions, single, renewable)
+        return _hierarchy(operator, closure, single, renewable)
     with at_once():
         alike = stand_in(*known)
         if mean_zero is None:
-            needs_values("operator and conditions", known, instead="pass mean_zero=True or False")
+            needs_values("operator and closure", known, instead="pass mean_zero=True or False")
         made = _hierarchy(alike[0], alike[1], single, True, mean_zero)
-    return made.renewed(operator, conditions=conditions)
+    return made.renewed(operator, closure=closure)
 
 
-def _hierarchy(operator, conditions, single, renewable, mean_zero=None) -> VCycle:
-    fine = reduced_matrix(operator, conditions)
-    free = restriction_of(operator, conditions).on_host
+def _hierarchy(operator, closure, single, renewable, mean_zero=None) -> VCycle:
+    fine = reduced_matrix(operator, closure)
+    free = restriction_of(operator, closure).on_host
     mean_zero = annihilates_constants(fine, free) if mean_zero is None else mean_zero
     dtype = np.dtype(np.float32) if single else fine.dtype
     width = USED * operator.k if isinstance(operator, Stencil) else None
@@ -375,8 +373,8 @@ def _level(matrix, tentative, dtype, room: int, coarse: int, width, on):
 
 
 @sized_jit
-def _renewed(plan, operator, conditions, mean_zero: bool, dtype) -> VCycle:
-    matrix, restriction = free_operator(operator, conditions)
+def _renewed(plan, operator, closure, mean_zero: bool, dtype) -> VCycle:
+    matrix, restriction = free_operator(operator, closure)
     below, free = renewal.free_divisor(operator, matrix, restriction)
     if not restriction.all_free:
         matrix, below = matrix + (1 - restriction), below + (1 - free)

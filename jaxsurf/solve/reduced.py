@@ -20,31 +20,31 @@ _ROUNDOFF = 32
 _NEAR, _FAR = 8, 1e-3
 
 
-def check_kinds(operator, conditions) -> None:
-    """Refuse what is no operator on scalar fields, and what are no conditions for it."""
+def check_kinds(operator, closure) -> None:
+    """Refuse what is no operator on scalar fields, and what is no closure for it."""
     instance(operator, AbstractOperator, "operator", "js.laplace_beltrami(cloud) makes one")
     check_scalar(operator)
-    if conditions is not None:
-        hint = "js.eliminate(cloud, conditions) makes one of conditions"
-        instance(conditions, Closure, "conditions", hint)
-        as_many("conditions", conditions.n, "the operator", operator.n)
+    if closure is not None:
+        hint = "js.eliminate(cloud, conditions) makes one"
+        instance(closure, Closure, "closure", hint)
+        as_many("closure", closure.n, "the operator", operator.n)
 
 
-def restriction_of(operator, conditions) -> Restriction:
+def restriction_of(operator, closure) -> Restriction:
     """P: to the points that are switched on and not bound."""
-    return Restriction(operator.n, conditions, operator.active)
+    return Restriction(operator.n, closure, operator.active)
 
 
-def free_operator(operator, conditions) -> tuple[AbstractOperator, Restriction]:
+def free_operator(operator, closure) -> tuple[AbstractOperator, Restriction]:
     """P A E and P as operators."""
-    restriction = restriction_of(operator, conditions)
-    if conditions is not None:
-        operator = operator @ conditions.extension
+    restriction = restriction_of(operator, closure)
+    if closure is not None:
+        operator = operator @ closure.extension
     return operator if restriction.all_free else restriction @ operator, restriction
 
 
-def stand_in(operator, conditions) -> tuple[AbstractOperator, Closure | None]:
-    """Concrete ones with the connections of a traced operator and conditions, for aggregates.
+def stand_in(operator, closure) -> tuple[AbstractOperator, Closure | None]:
+    """Concrete ones with the connections of a traced operator and closure, for aggregates.
 
     A point's nearest neighbours count alike, others hardly: of a Laplacian's weights that much is
     known without their values.
@@ -53,7 +53,7 @@ def stand_in(operator, conditions) -> tuple[AbstractOperator, Closure | None]:
         ValueError: the connections are traced too.
     """
     whole = lambda x: isinstance(x, Stencil | Closure)
-    return jax.tree.map(_stood_in, (operator, conditions), is_leaf=whole)
+    return jax.tree.map(_stood_in, (operator, closure), is_leaf=whole)
 
 
 def _stood_in(part):
@@ -83,14 +83,14 @@ def _known(*connections) -> None:
     )
 
 
-def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
+def free_matrix(operator, closure) -> scipy.sparse.csr_matrix:
     """P A E as a CSR matrix, zero in the rows of bound and of switched-off points.
 
     Raises:
         ValueError: traced or non-finite weights.
     """
-    operator, conditions = without_derivatives((operator, conditions))
-    if not is_concrete(operator, conditions):
+    operator, closure = without_derivatives((operator, closure))
+    if not is_concrete(operator, closure):
         raise ValueError(
             "multigrid is set up on concrete arrays: call js.multigrid or js.step_preconditioner "
             "outside jit and vmap, and pass its result as `preconditioner`; with renewable=True, "
@@ -100,28 +100,28 @@ def free_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
     if not np.isfinite(matrix.data).all():
         i = np.searchsorted(matrix.indptr, np.argmin(np.isfinite(matrix.data)), "right") - 1
         raise ValueError(f"the operator has weights that are not finite, first at point {i}")
-    if conditions is not None:
+    if closure is not None:
         restriction, extension = (
-            part.to_scipy() for part in (conditions.restriction, conditions.extension)
+            part.to_scipy() for part in (closure.restriction, closure.extension)
         )
         matrix = (restriction @ matrix @ extension).tocsr()
     if operator.active is not None:
         # In place: products change the order of the entries, and with it the aggregates.
         matrix.data *= np.repeat(np.asarray(operator.active), np.diff(matrix.indptr))
-    if conditions is not None or operator.active is not None:
+    if closure is not None or operator.active is not None:
         matrix.eliminate_zeros()
     return matrix
 
 
-def reduced_matrix(operator, conditions) -> scipy.sparse.csr_matrix:
+def reduced_matrix(operator, closure) -> scipy.sparse.csr_matrix:
     """P A E with the identity at points that are bound or switched off, as a CSR matrix.
 
     Raises:
         ValueError: traced or non-finite weights, or a zero row.
     """
-    matrix = free_matrix(operator, conditions)
-    if conditions is not None:
-        bound = np.asarray(conditions.bound).astype(matrix.dtype)
+    matrix = free_matrix(operator, closure)
+    if closure is not None:
+        bound = np.asarray(closure.bound).astype(matrix.dtype)
         matrix = (matrix + scipy.sparse.diags(bound)).tocsr()
     if operator.active is not None:
         off = np.flatnonzero(~np.asarray(operator.active))

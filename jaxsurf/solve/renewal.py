@@ -150,17 +150,17 @@ class Coarsening(eqx.Module):
         return self.coarse.matrix(coarse, constant, jnp.arange(len(constant)))
 
 
-def check_renewal(plan, n: int, operator, conditions) -> tuple[Any, ...]:
+def check_renewal(plan, n: int, operator, closure) -> tuple[Any, ...]:
     """The plan, and a problem that it serves, as constants."""
     if plan is None:
         raise ValueError(
             "the hierarchy was made without what renewing needs: pass renewable=True to "
             "js.multigrid or js.step_preconditioner"
         )
-    check_kinds(operator, conditions)
+    check_kinds(operator, closure)
     if operator.n != n:
         raise ValueError(f"operator for {operator.n} points, the hierarchy has {n}")
-    return plan, *jax.lax.stop_gradient((prepared(operator), conditions))
+    return plan, *jax.lax.stop_gradient((prepared(operator), closure))
 
 
 def plan_of(made: list, patterns: list) -> tuple[Coarsening, ...]:

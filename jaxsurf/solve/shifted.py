@@ -89,15 +89,15 @@ class ShiftedMultigrid(eqx.Module):
         return VCycle(False, levels, jnp.linalg.inv(self.mass - g * self.stiff))
 
     def renewed(
-        self, operator: AbstractOperator, *, conditions: Closure | None = None
+        self, operator: AbstractOperator, *, closure: Closure | None = None
     ) -> ShiftedMultigrid:
         """The hierarchies of another operator on the same points, as `VCycle.renewed`."""
         n = len(self.pairs[0].stiff_diagonal if self.pairs else self.stiff)
-        return _renewed(*renewal.check_renewal(self.plan, n, operator, conditions))
+        return _renewed(*renewal.check_renewal(self.plan, n, operator, closure))
 
 
 def shifted_multigrid(
-    operator: AbstractOperator, *, conditions: Closure | None = None, renewable: bool = False
+    operator: AbstractOperator, *, closure: Closure | None = None, renewable: bool = False
 ) -> ShiftedMultigrid:
     r"""Set up smoothed aggregation for $1 - g A$ once, for all g ≥ 0.
 
@@ -106,7 +106,7 @@ def shifted_multigrid(
 
     Args:
         operator: A, scalar, with concrete arrays and eigenvalues of real part ≤ 0.
-        conditions: from `js.eliminate` or `js.with_ghosts`.
+        closure: from `js.eliminate` or `js.with_ghosts`.
         renewable: keep what `ShiftedMultigrid.renewed` needs.
 
     Returns:
@@ -116,8 +116,8 @@ def shifted_multigrid(
         ImportError: pyamg is not installed (extra `multigrid`).
         ValueError: an operator that is traced, not finite, or has components.
     """
-    check_kinds(operator, conditions)
-    stiff = free_matrix(operator, conditions)
+    check_kinds(operator, closure)
+    stiff = free_matrix(operator, closure)
     mass = scipy.sparse.identity(stiff.shape[0], stiff.dtype, format="csr")
     constant = np.ones(stiff.shape[0])
     width = USED * operator.k if isinstance(operator, Stencil) else None
@@ -176,8 +176,8 @@ def _pair(mass, stiff, tentative, room: int, coarse: int, width, on):
 
 
 @sized_jit
-def _renewed(plan, operator, conditions) -> ShiftedMultigrid:
-    stiff, restriction = free_operator(operator, conditions)
+def _renewed(plan, operator, closure) -> ShiftedMultigrid:
+    stiff, restriction = free_operator(operator, closure)
     below, free = renewal.free_divisor(operator, stiff, restriction)
     matrices = stiff, lambda x: x
     found, (stiff, mass), _ = renewal.renewed_levels(plan, matrices, below, free, operator.active)

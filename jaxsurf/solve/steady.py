@@ -31,7 +31,7 @@ def solve(
     operator: AbstractOperator,
     rhs: Float[Array, "n *c"],
     *,
-    conditions: Closure | None = None,
+    closure: Closure | None = None,
     preconditioner: AbstractPreconditioner | None = None,
     solver: lx.AbstractLinearSolver | None = None,
     mean_zero: bool | None = None,
@@ -59,8 +59,8 @@ def solve(
         operator: A, a scalar stencil such as `js.laplace_beltrami(...)`, shifted and scaled at
             will, or a composition.
         rhs: f, `(n,)` or `(n, c)` for c problems at once; values at bound points do not count.
-        conditions: from `js.eliminate` or `js.with_ghosts`.
-        preconditioner: `js.multigrid(operator, conditions=conditions)` if None, also under
+        closure: from `js.eliminate` or `js.with_ghosts`.
+        preconditioner: `js.multigrid(operator, closure=closure)` if None, also under
             `grad`, and with `mean_zero` under `jit` and `vmap` where the neighbours are concrete.
             Where these are traced, make it outside and pass it, `renewed` inside where the
             operator is another. Or `js.jacobi(operator)`.
@@ -102,25 +102,25 @@ def solve(
         >>> bool(jnp.abs(solution.value - z).max() < 0.01)
         True
     """
-    check_system(operator, conditions, preconditioner, solver, atol)
+    check_system(operator, closure, preconditioner, solver, atol)
     rhs = as_float(rhs, "right-hand side", (operator.n,), (operator.n, "c"))
     rhs = rhs.astype(jnp.result_type(rhs, *jax.tree.leaves(operator), jnp.float32))
     rhs = switched_off(operator.active, rhs)
-    _check(operator, rhs, conditions)
+    _check(operator, rhs, closure)
     # What was not asked for may end at round-off.
     given, rtol = rtol is not None, tolerance(rtol, rhs.dtype)
     whole(max_steps, "max_steps", least=1)
-    concrete = is_concrete(operator, rhs, conditions, preconditioner)
+    concrete = is_concrete(operator, rhs, closure, preconditioner)
     if preconditioner is None:
-        preconditioner = multigrid(operator, conditions=conditions, mean_zero=mean_zero)
+        preconditioner = multigrid(operator, closure=closure, mean_zero=mean_zero)
     if mean_zero is None:
-        mean_zero = _is_mean_zero(operator, conditions, preconditioner)
+        mean_zero = _is_mean_zero(operator, closure, preconditioner)
     if solver is None:
         solver = BiCGStab(rtol, float(atol), np.asarray(max_steps))
     if not concrete:  # nothing concrete is differentiated
         operator = prepared(operator)
     limits = np.asarray(rtol), np.asarray(float(atol)), np.asarray(given), np.asarray(bool(project))
-    problem = (operator, conditions, preconditioner, tolerances_as_arrays(solver), limits)
+    problem = (operator, closure, preconditioner, tolerances_as_arrays(solver), limits)
     solution = _solve(rhs, *problem, bool(mean_zero), throw and not concrete)
     if throw and concrete:
         _raise_on_failure(solution, rhs.dtype, rtol, atol)
@@ -128,23 +128,23 @@ def solve(
 
 
 @sized_jit
-def _solve(rhs, operator, conditions, preconditioner, solver, limits, mean_zero, throw):
-    problem = (operator, conditions, preconditioner, solver, limits, mean_zero, throw)
+def _solve(rhs, operator, closure, preconditioner, solver, limits, mean_zero, throw):
+    problem = (operator, closure, preconditioner, solver, limits, mean_zero, throw)
     if rhs.ndim == 1:
         return _solve_one(rhs, *problem)
     columns = lx.Solution(1, 0, 0, 0)  # type: ignore[arg-type]
     return jax.vmap(lambda f: _solve_one(f, *problem), 1, columns)(rhs)
 
 
-def _solve_one(rhs, operator, conditions, preconditioner, solver, limits, mean_zero, throw):
+def _solve_one(rhs, operator, closure, preconditioner, solver, limits, mean_zero, throw):
     rtol, atol, given, project = limits
-    system = System.of(operator, conditions, rhs.dtype, mean_zero)
-    offset = jnp.zeros_like(rhs) if conditions is None else conditions.offset()
-    known = rhs if conditions is None else system.restriction(rhs - operator(offset))
+    system = System.of(operator, closure, rhs.dtype, mean_zero)
+    offset = jnp.zeros_like(rhs) if closure is None else closure.offset()
+    known = rhs if closure is None else system.restriction(rhs - operator(offset))
     inverse = jax.lax.stop_gradient(system.inverse(preconditioner))
     found = solve_system(system.matrix, known, solver, inverse)
     v = found.value
-    u = v if conditions is None else conditions.homogeneous(v) + offset
+    u = v if closure is None else closure.homogeneous(v) + offset
     if mean_zero:
         u = u - jnp.sum(u) / count_on(operator.active, operator.n)
         u = switched_off(operator.active, u)
@@ -195,28 +195,28 @@ def _solve_one(rhs, operator, conditions, preconditioner, solver, limits, mean_z
 # --- checks --------------------------------------------------------------------------------
 
 
-def _is_mean_zero(operator, conditions, preconditioner) -> bool:
+def _is_mean_zero(operator, closure, preconditioner) -> bool:
     if preconditioner.mean_zero is not None:
         return preconditioner.mean_zero
-    known = without_derivatives((operator, conditions))
+    known = without_derivatives((operator, closure))
     needs_values(
-        "operator and conditions",
+        "operator and closure",
         known,
         instead="pass mean_zero=True or False, or a preconditioner made outside jit and vmap",
     )
-    free = restriction_of(operator, conditions).on_host
-    return annihilates_constants(reduced_matrix(operator, conditions), free)
+    free = restriction_of(operator, closure).on_host
+    return annihilates_constants(reduced_matrix(operator, closure), free)
 
 
-def _check(operator, rhs, conditions) -> None:
+def _check(operator, rhs, closure) -> None:
     if rhs.ndim == 2 and not rhs.shape[1]:
         raise ValueError(
             f"right-hand side has shape {rhs.shape}: no column, one at least is needed"
         )
-    if is_concrete(rhs, conditions):
+    if is_concrete(rhs, closure):
         with at_once():  # constants, while the operator is traced
-            values = rhs if conditions is None else conditions(rhs)
-        named = "right-hand side" if conditions is None else "right-hand side or condition"
+            values = rhs if closure is None else closure(rhs)
+        named = "right-hand side" if closure is None else "right-hand side or condition"
         finite(values, named)
 
 

@@ -25,32 +25,32 @@ class System(eqx.Module):
 
     Args:
         operator: A.
-        conditions: E, and P which keeps free points; None if all are free that are switched on.
+        closure: E, and P which keeps free points; None if all are free that are switched on.
         sigma: σ; None if the constants are not in the null space of P A E.
     """
 
     operator: AbstractOperator
-    conditions: Closure | None
+    closure: Closure | None
     sigma: Float[Array, ""] | None = None
 
     @classmethod
-    def of(cls, operator, conditions, dtype, mean_zero: bool) -> System:
-        plain = cls(operator, conditions)
+    def of(cls, operator, closure, dtype, mean_zero: bool) -> System:
+        plain = cls(operator, closure)
         if not mean_zero:
             return plain
         # σ of the size and sign that keep the new eigenvalue among the others.
         signs = plain.restriction(1.0 - 2.0 * (jnp.arange(operator.n) % 2).astype(dtype))
         size = -jnp.vdot(signs, plain.reduced(signs)) / jnp.vdot(signs, signs)
-        return cls(operator, conditions, jax.lax.stop_gradient(jnp.where(size == 0, 1, size)))
+        return cls(operator, closure, jax.lax.stop_gradient(jnp.where(size == 0, 1, size)))
 
     @property
     def reduced(self) -> AbstractOperator:
         """P A E."""
-        return free_operator(self.operator, self.conditions)[0]
+        return free_operator(self.operator, self.closure)[0]
 
     @property
     def matrix(self) -> AbstractOperator:
-        matrix, restriction = free_operator(self.operator, self.conditions)
+        matrix, restriction = free_operator(self.operator, self.closure)
         if not restriction.all_free:
             matrix = matrix + (1 - restriction)
         return matrix if self.sigma is None else matrix - self.sigma * self.averaging
@@ -65,7 +65,7 @@ class System(eqx.Module):
     @property
     def restriction(self) -> Restriction:
         """P."""
-        return restriction_of(self.operator, self.conditions)
+        return restriction_of(self.operator, self.closure)
 
     @property
     def averaging(self) -> Averaging:
@@ -119,16 +119,16 @@ class Averaging(AbstractOperator):
         return self
 
 
-def check_system(operator, conditions, preconditioner, solver, atol) -> None:
+def check_system(operator, closure, preconditioner, solver, atol) -> None:
     """Refuse what is not of the kinds that a problem consists of."""
-    check_kinds(operator, conditions)
+    check_kinds(operator, closure)
     if preconditioner is not None:
         hint = "js.multigrid(operator) makes one"
         instance(preconditioner, AbstractPreconditioner, "preconditioner", hint)
     if solver is not None:
         instance(solver, lx.AbstractLinearSolver, "solver", "js.BiCGStab() is one")
     real(atol, "atol", least=0)
-    check_border(operator, conditions)
+    check_border(operator, closure)
 
 
 def tolerance(rtol, dtype) -> float:

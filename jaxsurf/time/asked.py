@@ -150,7 +150,7 @@ def check_coefficients(problem: AbstractEvolution, t0, t1) -> None:
     """
     for name, operator in vars(problem).items():
         if isinstance(operator, AbstractOperator) and name != "stabilization":
-            check_border(operator, problem.conditions)
+            check_border(operator, problem.closure)
     if is_concrete(t0, t1):
         problem.check(t0)
         problem.check(t1)

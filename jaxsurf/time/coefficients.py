@@ -114,23 +114,23 @@ def check_operator(
     return operator.n
 
 
-def check_closure(conditions: Any, n: int | None) -> None:
+def check_closure(closure: Any, n: int | None) -> None:
     """Raise on what is not a closure for n points."""
-    if conditions is None:
+    if closure is None:
         return
     hint = "eliminate(cloud, conditions) or with_ghosts makes one from conditions"
-    instance(conditions, Closure, "conditions", hint)
-    if n is not None and conditions.n != n:
-        raise ValueError(f"conditions are for {conditions.n} points, the operators have {n}")
+    instance(closure, Closure, "closure", hint)
+    if n is not None and closure.n != n:
+        raise ValueError(f"closure is of {closure.n} points, the operators have {n}")
 
 
 def check_mass(
-    mass: Any, conditions: Closure | None, n: int | None, on: Any = None
+    mass: Any, closure: Closure | None, n: int | None, on: Any = None
 ) -> Float[Array, " n"] | None:
     """The weights of the mass, as an array."""
     if mass is None:
         return None
-    if conditions is not None:
+    if closure is not None:
         raise ValueError("`mass` is for closed systems: with boundary conditions it may change")
     mass = switched_off(on, finite(as_float(mass, "mass"), "mass", on))
     if mass.ndim != 1 or (n is not None and mass.shape != (n,)):

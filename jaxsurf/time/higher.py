@@ -50,7 +50,7 @@ class BiharmonicDiffusion(_FourthOrder):
         laplacian: the Laplace–Beltrami operator; it is applied twice.
         stiffness: κ in units of length⁴ / time, a number.
         reaction: `(t, u, args) -> f`; None for none.
-        conditions: from `eliminate` or `with_ghosts`, for u and, with zero data, for its
+        closure: from `eliminate` or `with_ghosts`, for u and, with zero data, for its
             Laplacian; None for closed surfaces.
         mass: weights m, `(n,)`: $\sum_i m_i u_i$ is then conserved to round-off.
 
@@ -71,7 +71,7 @@ class BiharmonicDiffusion(_FourthOrder):
     laplacian: AbstractOperator
     stiffness: ArrayLike
     reaction: Callable | None
-    conditions: Closure | None
+    closure: Closure | None
     mass: Float[Array, " n"] | None
 
     def __init__(
@@ -80,25 +80,25 @@ class BiharmonicDiffusion(_FourthOrder):
         *,
         stiffness: ArrayLike = 1.0,
         reaction: Callable | None = None,
-        conditions: Closure | None = None,
+        closure: Closure | None = None,
         mass: Float[Array, " n"] | None = None,
     ):
         n = check_operator(laplacian, "laplacian", needed=True)
-        check_closure(conditions, n)
-        self.laplacian, self.conditions = laplacian, conditions
+        check_closure(closure, n)
+        self.laplacian, self.closure = laplacian, closure
         self.stiffness = number(stiffness, "stiffness", 0)
         self.reaction = function(reaction, "reaction")
-        self.mass = check_mass(mass, conditions, n, laplacian.active)
+        self.mass = check_mass(mass, closure, n, laplacian.active)
 
     @property
     def contractive(self):
-        return self.reaction is None and self.conditions is None
+        return self.reaction is None and self.closure is None
 
     def factors(self, g, u0):
         return jnp.full(2, jnp.sqrt(g * self.stiffness))
 
     def linear(self, t, u):
-        inner = homogeneous(self.conditions, self.laplacian(u))
+        inner = homogeneous(self.closure, self.laplacian(u))
         return balanced(self.laplacian(inner) * -jnp.asarray(self.stiffness), self.mass)
 
     def rest(self, t, u, args):
@@ -120,7 +120,7 @@ class CahnHilliard(_FourthOrder):
         mobility: M, in units of length² / time.
         potential: W', a function of u.
         splitting: s.
-        conditions: no-flux conditions from `eliminate` or `with_ghosts`, for u and the chemical
+        closure: no-flux conditions from `eliminate` or `with_ghosts`, for u and the chemical
             potential; None for closed surfaces.
         mass: weights m, `(n,)`: $\sum_i m_i u_i$ is then conserved to round-off.
 
@@ -140,7 +140,7 @@ class CahnHilliard(_FourthOrder):
     mobility: ArrayLike
     potential: Callable
     splitting: ArrayLike
-    conditions: Closure | None
+    closure: Closure | None
     mass: Float[Array, " n"] | None
 
     def __init__(
@@ -151,18 +151,18 @@ class CahnHilliard(_FourthOrder):
         mobility: ArrayLike = 1.0,
         potential: Callable = lambda u: u**3 - u,
         splitting: ArrayLike = 2.0,
-        conditions: Closure | None = None,
+        closure: Closure | None = None,
         mass: Float[Array, " n"] | None = None,
     ):
         n = check_operator(laplacian, "laplacian", needed=True)
-        check_closure(conditions, n)
+        check_closure(closure, n)
         if function(potential, "potential") is None:
             raise TypeError("potential is None, expected a function of u")
-        self.laplacian, self.conditions, self.potential = laplacian, conditions, potential
+        self.laplacian, self.closure, self.potential = laplacian, closure, potential
         self.width = number(width, "width", 0)
         self.mobility = number(mobility, "mobility", 0)
         self.splitting = number(splitting, "splitting", 0)
-        self.mass = check_mass(mass, conditions, n, laplacian.active)
+        self.mass = check_mass(mass, closure, n, laplacian.active)
 
     def factors(self, g, u0):
         r"""$1 - s\,\Delta + q\,\Delta^2$ with $s = g M s_0$, $q = g M \epsilon^2$."""
@@ -173,7 +173,7 @@ class CahnHilliard(_FourthOrder):
         return jnp.stack([large, product / jnp.where(large > 0, large, 1)])
 
     def _driven(self, potential):
-        potential = homogeneous(self.conditions, potential)
+        potential = homogeneous(self.closure, potential)
         return balanced(self.laplacian(potential) * jnp.asarray(self.mobility), self.mass)
 
     def linear(self, t, u):
@@ -204,7 +204,7 @@ class WaveEquation(AbstractEvolution):
         forcing: `(t, u, args) -> f`; None for none.
         stabilization: an operator that acts on $\partial_t u$, added to the right-hand side:
             `hyperviscosity` where waves near the spacing of the points grow.
-        conditions: from `eliminate` or `with_ghosts`; None for closed surfaces.
+        closure: from `eliminate` or `with_ghosts`; None for closed surfaces.
 
     Differentiable: in every array, forward and reverse.
 
@@ -222,7 +222,7 @@ class WaveEquation(AbstractEvolution):
     damping: InTime
     forcing: Callable | None
     stabilization: AbstractOperator | None
-    conditions: Closure | None
+    closure: Closure | None
 
     def __init__(
         self,
@@ -232,12 +232,12 @@ class WaveEquation(AbstractEvolution):
         damping: InTime = 0.0,
         forcing: Callable | None = None,
         stabilization: AbstractOperator | None = None,
-        conditions: Closure | None = None,
+        closure: Closure | None = None,
     ):
         n = check_operator(laplacian, "laplacian", needed=True)
         check_operator(stabilization, "stabilization", n)
-        check_closure(conditions, n)
-        self.laplacian, self.stabilization, self.conditions = laplacian, stabilization, conditions
+        check_closure(closure, n)
+        self.laplacian, self.stabilization, self.closure = laplacian, stabilization, closure
         on = laplacian.active
         self.speed = coefficient(speed, "speed", on=on)
         self.damping = coefficient(damping, "damping", on=on)
@@ -251,11 +251,11 @@ class WaveEquation(AbstractEvolution):
         return dfx.Tsit5(), "Tsit5: waves are not stiff"
 
     def closed(self, t, u):
-        if self.conditions is None:
+        if self.closure is None:
             return u
         value, velocity = u
         # The bound velocities are the derivatives of the bound values in time.
-        fill = lambda t, value: self.conditions(value, t)
+        fill = lambda t, value: self.closure(value, t)
         t = jnp.asarray(t, value.dtype)
         return jax.jvp(fill, (t, value), (jnp.ones_like(t), velocity))
 

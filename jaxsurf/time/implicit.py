@@ -191,8 +191,8 @@ class IMEX(_Implicit):
             y = jax.tree.map(jnp.add, start, found.value)
             return y, dfx.RESULTS.promote(found.result)
 
-        rates = tuple(terms.terms)
-        return _steps(tableau, rates, solve, t0, t1, y0, args, solver_state, made_jump)
+        both = tuple(terms.terms)
+        return _steps(tableau, both, solve, (t0, t1), y0, args, solver_state, made_jump)
 
 
 class SDIRK(_Implicit):
@@ -294,7 +294,7 @@ class SDIRK(_Implicit):
                 converged > 0, dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence
             )
 
-        return _steps(tableau, (terms,), solve, t0, t1, y0, args, solver_state, made_jump)
+        return _steps(tableau, (terms,), solve, (t0, t1), y0, args, solver_state, made_jump)
 
 
 def _options(preconditioner: Preconditioner | None, shift) -> dict:
@@ -306,7 +306,7 @@ def _options(preconditioner: Preconditioner | None, shift) -> dict:
 _FORCING = 1e-2
 
 
-def _steps(tableau: Tableau, terms, solve, t0, t1, y0, args, rates, made_jump):
+def _steps(tableau: Tableau, terms, solve, times, y0, args, rates, made_jump):
     """All stages of one step, for one term (implicit) or two (explicit, implicit).
 
     A loop over stages, not one after the other in the program: it compiles faster.
@@ -316,6 +316,7 @@ def _steps(tableau: Tableau, terms, solve, t0, t1, y0, args, rates, made_jump):
         rates: the terms at the start of the step, from the step before.
         made_jump: True if they jump there.
     """
+    t0, t1 = times
     rates = after_jump(made_jump, rates, lambda: tuple(term.vf(t0, y0, args) for term in terms))
     span = [term.contr(t0, t1) for term in terms]
     matrices = (tableau.explicit, tableau.implicit)[-len(terms) :]

@@ -128,8 +128,9 @@ def integrate(
     if checkpoint is not None:
         instance(checkpoint, Checkpoint, "checkpoint", "js.Checkpoint(path, every=...)")
     plan = planned(
-        problem, u0, t0, t1, solver, dt0, rtol, atol, controller, saveat, event, adjoint, args,
-        max_steps, progress and checkpoint is None, throw,
+        problem, u0, t0, t1, solver=solver, dt0=dt0, rtol=rtol, atol=atol, controller=controller,
+        saveat=saveat, event=event, adjoint=adjoint, args=args, max_steps=max_steps,
+        progress=progress and checkpoint is None, throw=throw,
     )  # fmt: skip
     if problem.caution and plan.concrete:
         warnings.warn(problem.caution, stacklevel=2)

@@ -61,7 +61,7 @@ class StepPreconditioner(eqx.Module):
         if u0 is None:
             u0 = self.structure.unflatten(jnp.zeros(x.shape, x.dtype) for x in self.shapes)
         now, _, factors = _factored(problem, u0)
-        hierarchy = self.hierarchy.renewed(now.laplacian, conditions=now.conditions)
+        hierarchy = self.hierarchy.renewed(now.laplacian, closure=now.closure)
         return StepPreconditioner(hierarchy, factors, self.shapes, self.structure)
 
 
@@ -139,7 +139,7 @@ def step_preconditioner(
         True
     """
     now, u0, factors = _factored(problem, u0)
-    hierarchy = shifted_multigrid(now.laplacian, conditions=now.conditions, renewable=renewable)
+    hierarchy = shifted_multigrid(now.laplacian, closure=now.closure, renewable=renewable)
     leaves, structure = jax.tree.flatten(u0)
     shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves)
     return StepPreconditioner(hierarchy, factors, shapes, structure)

@@ -37,7 +37,7 @@ class AbstractEvolution(eqx.Module):
 
     Example:
         >>> class Decay(js.AbstractEvolution):
-        ...     conditions: None
+        ...     closure: None
         ...     laplacian: js.AbstractOperator
         ...
         ...     def linear(self, t, u):
@@ -53,7 +53,7 @@ class AbstractEvolution(eqx.Module):
         True
     """
 
-    conditions: eqx.AbstractVar[Closure | None]
+    closure: eqx.AbstractVar[Closure | None]
 
     @property
     def diffusive(self) -> bool:
@@ -135,7 +135,7 @@ class AbstractEvolution(eqx.Module):
 
     def closed(self, t, u: PyTree[Array]) -> PyTree[Array]:
         """The state with its bound entries filled in."""
-        return u if self.conditions is None else self.conditions(u, t)
+        return u if self.closure is None else self.closure(u, t)
 
     def rate(self, t, u: PyTree[Array], args) -> PyTree[Array]:
         """The whole right-hand side, for explicit and for fully implicit solvers."""
@@ -145,22 +145,22 @@ class AbstractEvolution(eqx.Module):
 
     def implicit_rate(self, t, u: PyTree[Array], args) -> PyTree[Array]:
         """The part for implicit steps, linear in u: P L E u."""
-        within = jax.tree.map(lambda v: homogeneous(self.conditions, v), u)
+        within = jax.tree.map(lambda v: homogeneous(self.closure, v), u)
         return self._free(self.linear(t, within))
 
     def explicit_rate(self, t, u: PyTree[Array], args) -> PyTree[Array]:
         """The part for explicit steps: P (R(E u + e) + L e)."""
         rest = self.rest(t, self.closed(t, u), args)
-        if self.conditions is None:
+        if self.closure is None:
             return self._free(rest)
         none = self.closed(t, jax.tree.map(jnp.zeros_like, u))
         return self._free(added(rest, self.linear(t, none)))
 
     def _free(self, rate: PyTree[Array]) -> PyTree[Array]:
         rate = only_on(self.active, rate)
-        if self.conditions is None:
+        if self.closure is None:
             return rate
-        return jax.tree.map(self.conditions.restrict, rate)
+        return jax.tree.map(self.closure.restrict, rate)
 
 
 # --- pieces --------------------------------------------------------------------------------
@@ -202,8 +202,8 @@ def balanced(rate: Field, mass) -> Field:
     return rate - jnp.tensordot(mass / jnp.sum(mass), rate, axes=1)
 
 
-def homogeneous(conditions, u: Field) -> Field:
-    return u if conditions is None else conditions.homogeneous(u)
+def homogeneous(closure, u: Field) -> Field:
+    return u if closure is None else closure.homogeneous(u)
 
 
 def same_shape(value, u: Field, name: str) -> Array:

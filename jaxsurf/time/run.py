@@ -138,7 +138,7 @@ def solve(run: Run) -> tuple[dfx.Solution, Verdict | None]:
 
 
 def planned(
-    problem, u0, t0, t1, solver, dt0, rtol, atol, controller, saveat, event, adjoint, args,
+    problem, u0, t0, t1, *, solver, dt0, rtol, atol, controller, saveat, event, adjoint, args,
     max_steps, progress, throw,
 ) -> Plan:  # fmt: skip
     """Check all that `integrate` is given, and bring it into the form that is compiled."""
@@ -291,7 +291,7 @@ _AS_IT_IS = dfx.SubSaveAt(t1=True).fn
 
 def closed(problem: AbstractEvolution, what: Callable, now) -> Callable:
     """What is made of a state, from the state with its boundary values."""
-    if problem.conditions is None and what is _AS_IT_IS:
+    if problem.closure is None and what is _AS_IT_IS:
         return what
     return canonical(lambda t, y, args: what(t, problem.closed(t, y), args), *now)
 

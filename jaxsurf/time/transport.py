@@ -63,7 +63,7 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         conservative: the form above; if False $v\cdot\nabla u$ in place of $\nabla\cdot(v\,u)$.
         stabilization: an operator added to the right-hand side, that damps what advection
             cannot resolve: `hyperviscosity` or `upwind_viscosity`.
-        conditions: from `eliminate` or `with_ghosts`; None for closed surfaces.
+        closure: from `eliminate` or `with_ghosts`; None for closed surfaces.
         mass: weights m, `(n,)`. If given, transport is corrected by the smallest change that
             keeps $\sum_i m_i u_i$: a shift of the rate by its mean. Conserves to round-off.
 
@@ -90,7 +90,7 @@ class AdvectionDiffusionReaction(AbstractEvolution):
     reaction: Callable | None
     conservative: bool = eqx.field(static=True)
     stabilization: AbstractOperator | None
-    conditions: Closure | None
+    closure: Closure | None
     mass: Float[Array, " n"] | None
 
     def __init__(
@@ -103,7 +103,7 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         reaction: Callable | None = None,
         conservative: bool = True,
         stabilization: AbstractOperator | None = None,
-        conditions: Closure | None = None,
+        closure: Closure | None = None,
         mass: Float[Array, " n"] | None = None,
     ):
         if laplacian is None and velocity is None:
@@ -111,13 +111,13 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         n = check_operator(laplacian, "laplacian")
         n = check_operator(gradient, "gradient", n, out=None)
         check_operator(stabilization, "stabilization", n)
-        check_closure(conditions, n)
+        check_closure(closure, n)
         on = known_active(laplacian, gradient, stabilization)
         self.laplacian = laplacian
         self.diffusivity = coefficient(diffusivity, "diffusivity", 0, on)
         self.reaction, self.stabilization = function(reaction, "reaction"), stabilization
-        self.conservative, self.conditions = bool(conservative), conditions
-        self.mass = check_mass(mass, conditions, n, on)
+        self.conservative, self.closure = bool(conservative), closure
+        self.mass = check_mass(mass, closure, n, on)
         self.advection, self.gradient, self.velocity = None, None, None
         if velocity is not None:
             if gradient is None:
@@ -138,7 +138,7 @@ class AdvectionDiffusionReaction(AbstractEvolution):
     @property
     def contractive(self):
         compressed = self.moving and self.conservative
-        return self.reaction is None and self.conditions is None and not compressed
+        return self.reaction is None and self.closure is None and not compressed
 
     @property
     def n(self):

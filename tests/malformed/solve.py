@@ -127,10 +127,10 @@ CASES = [
     *operators("eigenmodes", modes),
     *limits("solve", solve),
     *limits("solve_nonlinear", newton),
-    Case("solve", "a Condition", lambda: solve(conditions=js.dirichlet([0], 0.0)),
-         ("conditions", "Closure", "js.eliminate")),
+    Case("solve", "a Condition", lambda: solve(closure=js.dirichlet([0], 0.0)),
+         ("closure", "Closure", "js.eliminate")),
     Case("solve", "conditions of other points", lambda: js.solve(
-        laplacian(), z(), conditions=js.eliminate(js.sphere(61), js.dirichlet([0], 0.0))),
+        laplacian(), z(), closure=js.eliminate(js.sphere(61), js.dirichlet([0], 0.0))),
         ("61", "60")),
     Case("solve", "a class as preconditioner",
          lambda: solve(preconditioner=js.JacobiPreconditioner), ("preconditioner",)),
@@ -149,8 +149,8 @@ CASES = [
          ("point 0", "js.eliminate", "js.free")),
     Case("solve", "a right-hand side of one sign", lambda: solve(rhs=jnp.ones(60)),
          ("right-hand side", "incompatible", "mean is 1", "project=True")),
-    Case("solve_nonlinear", "a Condition", lambda: newton(conditions=js.dirichlet([0], 0.0)),
-         ("conditions", "Closure")),
+    Case("solve_nonlinear", "a Condition", lambda: newton(closure=js.dirichlet([0], 0.0)),
+         ("closure", "Closure")),
     Case("solve_nonlinear", "no function", lambda: newton(reaction=3.0), ("reaction", "float")),
     Case("solve_nonlinear", "a reaction of another shape",
          lambda: newton(reaction=lambda u, a: u[:3]), ("reaction", "(3,)", "(60,)")),
@@ -166,8 +166,8 @@ CASES = [
     Case("eigenmodes", "text for k", lambda: modes(k="3"), ("k", "'3'")),
     Case("eigenmodes", "no modes", lambda: modes(k=0), ("k = 0", "1")),
     Case("eigenmodes", "too many modes", lambda: modes(k=31), ("k = 31", "30")),
-    Case("eigenmodes", "a Condition", lambda: modes(conditions=js.dirichlet([0], 0.0)),
-         ("conditions", "Closure")),
+    Case("eigenmodes", "a Condition", lambda: modes(closure=js.dirichlet([0], 0.0)),
+         ("closure", "Closure")),
     Case("eigenmodes", "negative distance", lambda: modes(degenerate=-1), ("degenerate", "-1")),
     Case("eigenmodes", "NaN as distance", lambda: modes(degenerate=np.nan), ("degenerate", "nan")),
     Case("eigenmodes", "a border without conditions", lambda: modes(marked()),
@@ -204,9 +204,9 @@ CASES = [
     *operators("multigrid", js.multigrid),
     *operators("jacobi", js.jacobi),
     Case("multigrid", "a Condition", lambda: js.multigrid(
-        laplacian(), conditions=js.dirichlet([0], 0.0)), ("conditions", "Closure")),
+        laplacian(), closure=js.dirichlet([0], 0.0)), ("closure", "Closure")),
     Case("jacobi", "a Condition", lambda: js.jacobi(
-        laplacian(), conditions=js.dirichlet([0], 0.0)), ("conditions", "Closure")),
+        laplacian(), closure=js.dirichlet([0], 0.0)), ("closure", "Closure")),
     Case("jacobi", "a composition", lambda: js.jacobi(laplacian() @ laplacian()),
          ("Composition",)),
     Case("multigrid", "NaN weights", lambda: js.multigrid(js.Stencil(
@@ -219,7 +219,7 @@ CASES = [
             ("no operator", lambda: renewable().renewed(jnp.eye(60)), ("operator", "array")),
             ("fewer points", lambda: renewable().renewed(js.identity(40)), ("40", "60")),
             ("a Condition", lambda: renewable().renewed(
-                laplacian(), conditions=js.dirichlet([0], 0.0)), ("conditions", "Closure")),
+                laplacian(), closure=js.dirichlet([0], 0.0)), ("closure", "Closure")),
         )
     ],
     Case("multigrid", "a zero row", lambda: js.multigrid(js.Stencil(

@@ -187,10 +187,10 @@ PROBLEMS = [
          ("laplacian", "(12, 12)")),
         ("text as operator", lambda make=make: make("L"), ("laplacian", "'L'", "Operator")),
         ("a gradient as Laplacian", lambda make=make: make(gradient()), ("laplacian", "(2,)")),
-        ("a condition", lambda make=make: make(laplacian(), conditions=js.dirichlet([0], 1.0)),
-         ("conditions", "Closure", "eliminate")),
-        ("conditions of other points", lambda make=make: make(laplacian(), conditions=closure(20)),
-         ("conditions", "20", "12")),
+        ("a condition", lambda make=make: make(laplacian(), closure=js.dirichlet([0], 1.0)),
+         ("closure", "Closure", "eliminate")),
+        ("conditions of other points", lambda make=make: make(laplacian(), closure=closure(20)),
+         ("closure", "20", "12")),
     )
 ]  # fmt: skip
 
@@ -217,7 +217,7 @@ SPECIAL = [
         ("mass of other length", lambda: heat(mass=np.ones(5)), ("mass", "(5,)", "(12,)")),
         ("mass zero", lambda: heat(mass=np.zeros(N)), ("mass", "0.0")),
         ("mass NaN", lambda: heat(mass=np.full(N, nan)), ("mass", "nan")),
-        ("mass with conditions", lambda: heat(mass=np.ones(N), conditions=closure()),
+        ("mass with conditions", lambda: heat(mass=np.ones(N), closure=closure()),
          ("mass", "conditions")),
     )
 ] + [

@@ -14,7 +14,7 @@ TESTED = {
         "gradient": {
             "weights": "test_steady.py::test_derivatives_in_weights_and_right_hand_side",
             "rhs": "test_steady.py::test_derivatives_in_weights_and_right_hand_side",
-            "conditions": "test_steady.py::test_derivatives_with_conditions_and_jacobi",
+            "closure": "test_steady.py::test_derivatives_with_conditions_and_jacobi",
             "points": "test_steady.py::test_derivative_in_the_geometry",
         },
         "jit": "test_steady.py::test_no_retracing_for_other_values",
@@ -49,7 +49,7 @@ TESTED = {
         "test_solve_forms.py::test_modes_with_images",
         "gradient": {
             "weights": "test_eigen.py::test_derivatives_of_what_belongs_to_a_group",
-            "conditions": "test_eigen.py::test_derivative_in_the_conditions",
+            "closure": "test_eigen.py::test_derivative_in_the_conditions",
             "points": "test_eigen.py::test_derivatives_of_simple_modes",
             "normals": "test_solve_forms.py::test_gradient_of_values_in_normals",
         },

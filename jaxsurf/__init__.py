@@ -31,6 +31,11 @@ from .ghosts import with_ghosts as with_ghosts
 from .io import read as read
 from .io import read_fields as read_fields
 from .io import write as write
+from .moving.evolve import Evolution as Evolution
+from .moving.evolve import evolve as evolve
+from .moving.motions import AbstractMotion as AbstractMotion
+from .moving.motions import MeanCurvatureFlow as MeanCurvatureFlow
+from .moving.motions import Motion as Motion
 from .neighbors import Neighbors as Neighbors
 from .neighbors import find_neighbors as find_neighbors
 from .normals import estimate_normals as estimate_normals

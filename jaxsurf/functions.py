@@ -112,7 +112,8 @@ class Program:
             inputs[i] = value
         count = len(self._jaxpr.constvars)
         out = jax.core.eval_jaxpr(self._jaxpr, inputs[:count], *inputs[count:])
-        return jax.tree.unflatten(self._given, out)
+        # A result that is a constant comes as the number that the program holds.
+        return jax.tree.unflatten(self._given, map(jnp.asarray, out))
 
     def __hash__(self):
         return self._hash

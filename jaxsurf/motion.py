@@ -113,8 +113,8 @@ def folded(cloud, neighbors):
 
 
 @jax.jit
-def unreached(before, after, neighbors):
-    """Whether points outside a list may have come nearer than those in it.
+def unreached(before, after, neighbors, share=_SKIN):
+    """Whether points outside a list may have come nearer than a share of the way to its farthest.
 
     They were at least as far as the farthest of the list. They came nearer by no other factor
     than those that are nearly as far, if the motion is smooth.
@@ -132,4 +132,4 @@ def unreached(before, after, neighbors):
     farthest = jnp.max(old, axis=0)
     outer = (old > 0.5 * farthest) & (old > 0)
     stretch = jnp.min(jnp.where(outer, new / jnp.where(outer, old, 1), jnp.inf), axis=0)
-    return stretch * farthest < _SKIN * jnp.max(new, axis=0)
+    return stretch * farthest < share * jnp.max(new, axis=0)

@@ -259,6 +259,11 @@ class WaveEquation(AbstractEvolution):
         t = jnp.asarray(t, value.dtype)
         return jax.jvp(fill, (t, value), (jnp.ones_like(t), velocity))
 
+    def dilution(self, u, divergence):
+        """Of the velocity alone: Suchde and Kuhnert 2019, eq. 42."""
+        value, velocity = u
+        return jnp.zeros_like(value), -per_point(divergence, velocity) * velocity
+
     def linear(self, t, u):
         value, velocity = u
         speed = per_point(at_time(self.speed, "speed", t), value)

@@ -137,6 +137,13 @@ class AbstractEvolution(eqx.Module):
         """The state with its bound entries filled in."""
         return u if self.closure is None else self.closure(u, t)
 
+    def dilution(self, u: PyTree[Array], divergence: Float[Array, " n"]) -> PyTree[Array]:
+        r"""What a surface that moves with velocity v adds to the rate, from $\nabla\cdot v$.
+
+        Amounts per area, $-u\,\nabla\cdot v$, unless a problem says otherwise.
+        """
+        return jax.tree.map(lambda v: -per_point(divergence, v) * v, u)
+
     def rate(self, t, u: PyTree[Array], args) -> PyTree[Array]:
         """The whole right-hand side, for explicit and for fully implicit solvers."""
         u = self.closed(t, u)

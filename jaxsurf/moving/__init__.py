@@ -1,0 +1,1 @@
+"""Surfaces that move, and equations on them."""

@@ -1,0 +1,274 @@
+r"""One call from a motion and a surface to where it is later, with fields on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
+
+from ..arguments import as_float, finite, instance, real
+from ..cloud import PointCloud
+from ..discretization import Discretization, discretize
+from ..failures import is_concrete, raise_at, refuse
+from ..motion import CODES, unreached
+from ..normals import refit_normals
+from ..renew import NeighborSearch
+from ..stencils.dcpse import DCPSE
+from ..stencils.method import AbstractMethod
+from ..time.asked import check_coefficients
+from ..time.integrate import integrate
+from ..time.problem import AbstractEvolution, checked_problem
+from .motions import AbstractMotion, checked_motion
+from .problem import Moving, joined, parted
+
+# Lists are found anew once points outside may come as near as this share of the farthest in them.
+_WORN = 0.75
+
+
+class Evolution(eqx.Module):
+    """A surface and fields on it over time: made by `evolve`.
+
+    Args:
+        ts: times, `(m,)`.
+        surfaces: the surface at each.
+        fields: those at each, of the structure given.
+        stats: how many steps were taken and refused, how often neighbours were found anew; the
+            solver and why.
+
+    Example:
+        >>> motion = js.Motion(lambda t, surface, fields, args: surface.cloud.normals)
+        >>> solution = js.evolve(motion, js.sphere(300), t1=1.0, saveat=[0.0, 0.5])
+        >>> solution.ts.tolist(), solution.clouds[1].n
+        ([0.0, 0.5, 1.0], 300)
+    """
+
+    ts: Float[Array, " m"]
+    surfaces: list[Discretization]
+    fields: list[PyTree[Array]]
+    stats: dict[str, Any]
+
+    @property
+    def clouds(self) -> list[PointCloud]:
+        """The cloud at each time."""
+        return [surface.cloud for surface in self.surfaces]
+
+    @property
+    def history(self) -> dict[str, Any]:
+        r"""Number of points, area, enclosed volume and integrals of the fields at each time.
+
+        The volume is $\\tfrac1d\\int x\\cdot n$, of closed surfaces. Raises what `areas` does.
+        """
+        rows = [_measured(*row) for row in zip(self.surfaces, self.fields)]
+        return {"t": self.ts} | jax.tree.map(lambda *values: jnp.stack(values), *rows)
+
+    def __repr__(self):
+        if not is_concrete(self.ts):
+            return "Evolution(traced)"
+        steps = ", ".join(f"{name} {value}" for name, value in self.stats.items())
+        first, last = float(self.ts[0]), float(self.ts[-1])
+        return (
+            f"Evolution({len(self.surfaces)} times from {first:g} to {last:g}, "
+            f"{self.surfaces[-1].n} points, {steps})"
+        )
+
+
+def evolve(
+    motion: AbstractMotion,
+    cloud: PointCloud | Discretization,
+    *,
+    t1: ArrayLike,
+    t0: ArrayLike = 0.0,
+    fields: PyTree[Array] = (),
+    problem: Callable[[Discretization], AbstractEvolution] | None = None,
+    method: AbstractMethod | None = None,
+    saveat: Sequence[float] | None = None,
+    solver: dfx.AbstractSolver | None = None,
+    dt0: ArrayLike | None = None,
+    rtol: float = 1e-5,
+    atol: float = 1e-7,
+    args: Any = None,
+) -> Evolution:
+    r"""Move a surface, and integrate an equation on it.
+
+    Points and fields are one state, $\dot x = v$ and $\dot u + u\,\nabla_S\cdot v = f(u)$ along the
+    path of each point; the surface is made anew from the points of every stage, so that a solver
+    keeps its order. Neighbours stay the same until the surface has been sheared or stretched by
+    about an eighth; they and the normals are then found anew, between two steps.
+
+    Args:
+        motion: `Motion(velocity)`, `MeanCurvatureFlow()`, or one of your own.
+        cloud: n points with unit normals at t0, or a surface from `discretize`.
+        t1, t0: end and start.
+        fields: on the cloud, `(n, *c)`, or several as a tuple; none by default.
+        problem: makes the problem of the fields from the surface, say
+            `lambda surface: js.AdvectionDiffusionReaction(surface.laplacian)`. What it conserves is
+            diluted as the surface grows; of a `WaveEquation` that is $\partial_t u$. If None,
+            fields go with the points unchanged.
+        method: of the operators; `DCPSE(order=2)` if None, or that of a surface given.
+        saveat: times to save; t1 is always saved.
+        solver, dt0, rtol, atol: as for `integrate`; the solver that suits motion and problem if
+            None.
+        args: handed to velocity, reactions and forcings: what is differentiated goes in here, or
+            in `cloud` and `fields`.
+
+    Returns:
+        `Evolution`: `ts`, `clouds`, `surfaces`, `fields`, `history`.
+
+    Accuracy: in time that of the solver; in space that of the method (`tests/test_moving.py`).
+    Differentiable: forward and reverse, under `jit`, with the neighbours that there were at t0,
+        which must then serve until t1.
+    Raises:
+        TypeError: arguments of other kinds.
+        ValueError: wrong shapes; times that are not in order; on concrete arrays a surface that
+            folds (named by index, see `Discretization.code`), a fit that turns a normal over.
+            Differentiated or compiled, an error of the run time.
+        IntegrationError: the end was not reached, see `integrate`.
+    Source: Suchde and Kuhnert 2019, eqs. 28 and 42; in time by the method of lines instead.
+
+    Example:
+        >>> def velocity(t, surface, fields, args):
+        ...     return 0.5 * surface.cloud.normals
+        >>> cloud = js.sphere(500)
+        >>> heat = lambda surface: js.AdvectionDiffusionReaction(surface.laplacian)
+        >>> u0 = cloud.points[:, 0] * cloud.points[:, 1]
+        >>> solution = js.evolve(js.Motion(velocity), cloud, t1=1.0, fields=u0, problem=heat)
+        >>> exact = 1.5**-2 * jnp.exp(-12 * (1 - 1 / 1.5)) * u0
+        >>> bool(jnp.abs(solution.fields[-1] - exact).max() < 1e-2 * exact.max())
+        True
+    """
+    surface = _discretized(checked_motion(motion), cloud, method)
+    n = surface.n
+    fields = jax.tree.map(lambda u: finite(as_float(u, "fields", (n, ...)), "fields"), fields)
+    times = _times(t0, t1, saveat)
+    if problem is not None:
+        if not callable(problem) or isinstance(problem, AbstractEvolution):
+            raise TypeError(
+                f"problem is a {type(problem).__name__}, expected a function of the surface: "
+                "lambda surface: js.AdvectionDiffusionReaction(surface.laplacian), say"
+            )
+        check_coefficients(checked_problem(problem(surface)), t0, t1)
+    options = dict(solver=solver, dt0=dt0, rtol=rtol, atol=atol, args=args)
+    moving = Moving.of(surface, motion, problem)
+    run = _followed if is_concrete(surface, fields, args, t0, t1) else _kept
+    return run(moving, joined(surface.cloud.points, fields), t0, times, options)
+
+
+def _discretized(motion, cloud, method) -> Discretization:
+    if isinstance(cloud, Discretization):
+        if method is not None:
+            raise ValueError(f"method = {method!r}, but the surface given has {cloud.method!r}")
+        return cloud
+    instance(cloud, PointCloud, "cloud", "js.PointCloud(points, normals), or js.discretize(cloud)")
+    return discretize(cloud, method=DCPSE(order=2) if method is None else method)
+
+
+def _times(t0, t1, saveat) -> list:
+    """When to save, t1 last."""
+    for name, value in (("t0", t0), ("t1", t1)):
+        real(value, name)
+    saved = [] if saveat is None else list(saveat)
+    for value in saved:
+        real(value, "saveat")
+    if not is_concrete(t0, t1, *saved):
+        return [*saved, t1]
+    values = np.asarray([float(t0), *map(float, saved), float(t1)])
+    if not values[-1] > values[0]:
+        raise ValueError(f"t1 = {values[-1]:g}, expected above t0 = {values[0]:g}")
+    text = "saveat turns back after {v} (entry {i}), or leaves the run from t0 to t1"
+    raise_at(np.diff(values)[1:-1] <= 0, text, values[1:-2])
+    raise_at(
+        (values[1:-1] < values[0]) | (values[1:-1] > values[-1]),
+        f"saveat is {{v}} at entry {{i}}, expected within {values[0]:g} and {values[-1]:g}",
+        values[1:-1],
+    )
+    return [*saved, *([t1] if not saved or values[-2] < values[-1] else [])]
+
+
+# --- a run on the host: neighbours are found anew ------------------------------------------
+
+
+class _Worn(eqx.Module):
+    """True once the lists of a surface do not serve well."""
+
+    surface: Discretization
+
+    def __call__(self, t, y, args, **_) -> Bool[Array, ""]:
+        cloud, neighbors = self.surface.cloud, self.surface.neighbors
+        return jnp.any(unreached(cloud.points, y[0], neighbors, _WORN))
+
+
+def _followed(moving: Moving, state, t, times, options) -> Evolution:
+    surfaces, saved, steps, renewals = [], [], np.zeros(2, int), 0
+    search, why = None, ""
+    for target in times:
+        while float(t) < float(target):
+            event = dfx.Event(_Worn(moving.surface))
+            solution = integrate(moving, state, t0=t, t1=target, event=event, **options)
+            assert solution.ts is not None and solution.ys is not None
+            t, state = solution.ts[-1], jax.tree.map(lambda y: y[-1], solution.ys)
+            counts = (solution.stats[f"num_{kind}_steps"] for kind in ("accepted", "rejected"))
+            steps, why = steps + [int(count) for count in counts], solution.stats["solver"]
+            if solution.result == dfx.RESULTS.event_occurred:
+                surface, search = _renewed(moving, state[0], search)
+                moving = Moving.of(surface, moving.motion, moving.on)
+                renewals += 1
+        surfaces.append(moving.surface_at(state[0]))
+        saved.append(moving.fields(target, state))
+    stats = {"steps": int(steps[0]), "refused": int(steps[1]), "renewals": renewals, "solver": why}
+    return Evolution(jnp.asarray(times, state[0].dtype), surfaces, saved, stats)
+
+
+def _renewed(
+    moving: Moving, points, search: NeighborSearch | None
+) -> tuple[Discretization, NeighborSearch]:
+    """The surface at these points with normals and neighbours found anew, and room for the next."""
+    surface, moved = moving.surface, moving.surface_at(points)
+    normals, degree = moved.cloud.normals, surface.method.polynomial_degree
+    normals = refit_normals(points, normals, surface.neighbors, degree=degree)
+    search = surface.search() if search is None else search
+    try:
+        return surface.moved(points, normals, search=search), search
+    except ValueError:  # there is no room, or an error that will be raised again
+        cloud = eqx.tree_at(lambda c: c.normals, moved.cloud, normals)
+        surface = discretize(cloud, method=surface.method)
+        return surface, surface.search()
+
+
+# --- a run that is traced: the same neighbours all the way ----------------------------------
+
+
+def _kept(moving: Moving, state, t, times, options) -> Evolution:
+    surfaces, saved = [], []
+    for target in times:
+        if target is not t:
+            found = integrate(moving, state, t0=t, t1=target, **options)
+            t, state = target, jax.tree.map(lambda y: y[-1], found.ys)
+        points, fields = parted(state)
+        code = moving.surface_at(points).code
+        text = "the surface does not keep the neighbours it had at t0: " + "; ".join(
+            f"{number}: {text}" for number, text in CODES.items()
+        )
+        points = refuse(points, jnp.any(code > 0), text)
+        surfaces.append(moving.surface_at(points))
+        saved.append(moving.fields(target, joined(points, fields)))
+    return Evolution(jnp.stack([jnp.asarray(s) for s in times]), surfaces, saved, {})
+
+
+# --- what is told of it --------------------------------------------------------------------
+
+
+def _measured(surface: Discretization, fields) -> dict[str, Any]:
+    cloud = surface.cloud
+    height = jnp.sum(cloud.points * cloud.normals, axis=1)
+    return {
+        "n": jnp.asarray(cloud.n if cloud.active is None else jnp.sum(cloud.active)),
+        "area": jnp.sum(surface.areas),
+        "volume": surface.integrate(height) / cloud.dim,
+        "mass": jax.tree.map(surface.integrate, fields),
+    }

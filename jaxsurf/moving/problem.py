@@ -1,0 +1,105 @@
+r"""Points and fields as one state: the surface is made anew from the points of every stage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from ..arguments import switched_off
+from ..discretization import Discretization
+from ..functions import numbers_as_arrays
+from ..motion import carried
+from ..stencils.algebra import AbstractOperator
+from ..stencils.stencil import Stencil
+from ..time.explicit import RKC2
+from ..time.problem import AbstractEvolution
+from .motions import AbstractMotion
+
+
+class Moving(AbstractEvolution):
+    r"""$\dot x = v$ and $\dot u + u\,\nabla\cdot v = f(u)$ on the surface that moves.
+
+    Args:
+        surface: where it was when its neighbours were found.
+        gradient: of the surface there, which tells normals from positions.
+        motion: v.
+        on: makes the problem of the fields from a surface; None: fields go with the points.
+        pull: the stiff part of v on the surface of a state, see `at`.
+        problem: that of the fields there.
+    """
+
+    closure: None
+    surface: Discretization
+    gradient: Stencil
+    motion: AbstractMotion
+    on: Callable | None
+    pull: AbstractOperator | None = None
+    problem: AbstractEvolution | None = None
+
+    @classmethod
+    def of(cls, surface: Discretization, motion: AbstractMotion, on: Callable | None) -> Moving:
+        return cls(None, surface, surface.gradient, motion, on)
+
+    def surface_at(self, points: Array) -> Discretization:
+        """The surface with its points elsewhere."""
+        before = self.surface.cloud
+        normals = carried(self.gradient, before.normals, before.points, points)[0]
+        return self.surface.moved(points, switched_off(self.active, normals, before.normals))
+
+    @property
+    def active(self):
+        return self.surface.cloud.active
+
+    def suggested_solver(self):
+        if self.motion.stiff:
+            return RKC2(), "RKC2: a velocity by curvature, by explicit steps with many stages"
+        if self.on is None:
+            return dfx.Tsit5(), "Tsit5: a velocity without derivatives is not stiff"
+        return self.on(self.surface).suggested_solver()
+
+    def rate(self, t, u, args):
+        points, fields = parted(u)
+        surface = self.surface_at(points)
+        velocity = self.motion.velocity(t, surface, fields, args)
+        if self.on is None:
+            return joined(velocity, jax.tree.map(jnp.zeros_like, fields))
+        problem = self.on(surface)
+        dilution = problem.dilution(fields, surface.divergence(velocity))
+        change = problem.rate(t, fields, args)
+        return joined(velocity, jax.tree.map(jnp.add, change, dilution))
+
+    def at(self, t, u):
+        surface = self.surface_at(u[0])
+        problem = None if self.on is None else numbers_as_arrays(self.on(surface))
+        frozen = self.motion.pull(surface), problem
+        parts = lambda moving: (moving.pull, moving.problem)
+        return eqx.tree_at(parts, self, frozen, is_leaf=lambda x: x is None)
+
+    def linear(self, t, u):
+        points, fields = parted(u)
+        pulled = jnp.zeros_like(points) if self.pull is None else self.pull(points)
+        if self.problem is None:
+            return joined(pulled, jax.tree.map(jnp.zeros_like, fields))
+        return joined(pulled, self.problem.implicit_rate(t, fields, None))
+
+    def rest(self, t, u, args):
+        return jax.tree.map(jnp.subtract, self.rate(t, u, args), self.linear(t, u))
+
+    def fields(self, t, u: PyTree[Array]) -> PyTree[Array]:
+        """With their bound values filled in."""
+        points, fields = parted(u)
+        return fields if self.on is None else self.on(self.surface_at(points)).closed(t, fields)
+
+
+def joined(points: Array, fields: PyTree[Array]) -> tuple:
+    """A state of points and fields, if there are any (diffrax takes no empty parts)."""
+    return (points, fields) if jax.tree.leaves(fields) else (points,)
+
+
+def parted(state: tuple) -> tuple[Array, PyTree[Array]]:
+    return state if len(state) == 2 else (*state, ())

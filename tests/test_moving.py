@@ -1,0 +1,191 @@
+r"""Surfaces that move, and equations on them, against exact solutions."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsurf as js
+
+CLOUD = js.sphere(200)
+SURFACE = js.discretize(CLOUD, method=js.GFDM(degree=2))
+X, Y, Z = CLOUD.points.T
+# Rate at which the radius of a sphere grows.
+RATE = 0.5
+
+
+def growing(t, surface, fields, args):
+    return args * surface.cloud.normals
+
+
+def heat(surface):
+    return js.AdvectionDiffusionReaction(surface.laplacian)
+
+
+def grown(rate=RATE, cloud=SURFACE, u=X * Y, **options):
+    """Heat on a sphere that grows."""
+    options = dict(t1=1.0, fields=u, problem=heat, args=rate) | options
+    return js.evolve(js.Motion(growing), cloud, **options)
+
+
+def exact(eigenvalue, t=1.0, rate=RATE):
+    r"""Factor of a field: $r^{-2}\exp(\lambda\int r^{-2})$."""
+    r = 1 + rate * t
+    return r**-2 * np.exp(eigenvalue * (1 - 1 / r) / rate)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order, least", [(2, 1.9), (3, 2.7)])
+def test_solvers_keep_their_order_though_the_geometry_moves(order, least):
+    """Steps halved twice; the eigenvalue is that of the stencils, so that only time is judged."""
+    eigenvalue = float(jnp.vdot(X * Y, SURFACE.laplacian(X * Y)) / jnp.vdot(X * Y, X * Y))
+    errors = []
+    for steps in (16, 32):
+        end = grown(solver=js.IMEX(order=order), dt0=1 / steps)
+        factor = float(jnp.vdot(X * Y, end.fields[-1]) / jnp.vdot(X * Y, X * Y))
+        errors.append(abs(factor / exact(eigenvalue) - 1))
+        radius = jnp.linalg.norm(end.clouds[-1].points, axis=1)
+        assert float(jnp.abs(radius - 1.5).max()) < 1e-10
+    assert np.log2(errors[0] / errors[1]) > least and errors[1] < 1e-3
+
+
+@pytest.mark.slow
+def test_a_sphere_shrinks_by_its_curvature():
+    """r² falls by twice the time, but for the error of the stencils, Δx = -2 c x."""
+    end = js.evolve(js.MeanCurvatureFlow(), SURFACE, t1=0.2, solver=js.IMEX(order=2), dt0=0.02)
+    points = CLOUD.points
+    c = -float(jnp.vdot(points, SURFACE.laplacian(points)) / jnp.vdot(points, points)) / 2
+    assert abs(c - 1) < 0.05
+    radius = jnp.linalg.norm(end.clouds[-1].points, axis=1)
+    assert abs(float(jnp.mean(radius)) / (1 - 0.4 * c) ** 0.5 - 1) < 1e-3
+    turned = jnp.sum(end.clouds[-1].normals * points, axis=1)
+    assert float(turned.min()) > 1 - 1e-6
+
+
+@pytest.mark.slow
+def test_an_ellipsoid_that_keeps_its_volume_loses_area():
+    surface = js.discretize(js.ellipsoid(200, (1.2, 1.0, 0.85)), method=js.GFDM(degree=2))
+    flow = js.MeanCurvatureFlow(keep_volume=True)
+    found = js.evolve(flow, surface, t1=0.1, saveat=[0.0, 0.05], solver=js.IMEX(order=2), dt0=0.025)
+    history = found.history
+    assert np.all(np.diff(history["area"]) < 0)
+    np.testing.assert_allclose(history["volume"], history["volume"][0], rtol=2e-3)
+
+
+@pytest.mark.slow
+def test_neighbours_are_found_anew_where_a_surface_is_sheared():
+    """Latitudes that turn at different speeds leave the sphere and z as they are."""
+
+    def shear(t, surface, fields, args):
+        x, y, z = surface.cloud.points.T
+        return 3 * z[:, None] * jnp.stack([-y, x, 0 * x], axis=1)
+
+    found = js.evolve(js.Motion(shear), SURFACE, t1=0.6, fields=Z, problem=heat)
+    assert found.stats["renewals"] > 0
+    np.testing.assert_allclose(jnp.linalg.norm(found.clouds[-1].points, axis=1), 1, atol=1e-4)
+    # As far from exp(-2t) z as the Laplacians of start and end are from -2 z.
+    wrong = [float(jnp.abs(s.laplacian(Z) + 2 * Z).max()) for s in (SURFACE, found.surfaces[-1])]
+    np.testing.assert_allclose(found.fields[-1], np.exp(-1.2) * Z, atol=0.6 * max(wrong))
+    wanted = np.asarray(js.find_neighbors(found.clouds[-1], k=10).indices)
+    nearest = np.asarray(found.surfaces[-1].neighbors.indices)
+    assert all(set(a) <= set(b) for a, b in zip(wanted, nearest))
+
+
+@pytest.mark.slow
+def test_waves_are_diluted_in_their_velocity():
+    r"""$\phi = \sin(\sqrt 6 t)\,x y$ with the forcing that belongs to it (E18)."""
+    root = 6**0.5
+
+    def problem(surface):
+        x, y, _ = surface.cloud.points.T
+
+        def forcing(t, u, args):
+            # Dφ/Dt = (c √6 + s 2 r'/r) x y along the path of a point, s and c of √6 t.
+            s, c, g = jnp.sin(root * t), jnp.cos(root * t), RATE / (1 + RATE * t)
+            second = -6 * s + 4 * root * c * g + 2 * s * g**2
+            first = root * c + 2 * s * g
+            return (second + 2 * g * first + 6 * s / (1 + RATE * t) ** 2) * x * y
+
+        return js.WaveEquation(surface.laplacian, forcing=forcing)
+
+    start = (0 * X, root * X * Y)
+    end = grown(u=start, problem=problem, rtol=1e-6)
+    x, y, _ = end.clouds[-1].points.T
+    u = np.sin(root) * x * y
+    assert float(jnp.linalg.norm(end.fields[-1][0] - u) / jnp.linalg.norm(u)) < 2e-2
+
+
+@pytest.mark.slow
+def test_derivatives_through_the_motion():
+    """In rate, points and fields, against differences: one program with IMEX steps."""
+    weights = jnp.exp(X)
+
+    def f(rate, points, u):
+        cloud = js.PointCloud(points, CLOUD.normals)
+        surface = js.Discretization(cloud, SURFACE.neighbors, SURFACE.method)
+        end = grown(rate, surface, u, t1=0.2, solver=js.IMEX(order=2), dt0=0.1)
+        return jnp.vdot(weights, end.fields[-1]) + jnp.sum(weights * end.clouds[-1].points[:, 0])
+
+    at = (jnp.asarray(RATE), CLOUD.points, Z)
+    slopes = jax.jit(jax.grad(f, argnums=(0, 1, 2)))(*at)
+    value = jax.jit(f)
+    ways = jnp.asarray(0.3), 0.1 * jnp.sin(3 * CLOUD.points[:, ::-1]), jnp.cos(2 * Y)
+    for i, way in enumerate(ways):
+        h = 1e-4
+        above, below = (
+            value(*(a + e * way if j == i else a for j, a in enumerate(at))) for e in (h, -h)
+        )
+        difference = (above - below) / (2 * h)
+        assert abs(float(jnp.vdot(slopes[i], way) - difference)) < 1e-6 * abs(difference) + 1e-8
+
+
+@pytest.mark.slow
+def test_mapped_and_in_single_precision():
+    """Two rates at once; and all of it in float32."""
+    end = lambda rate: (
+        js.evolve(js.Motion(growing), SURFACE, t1=1.0, args=rate, solver=dfx.Heun(), dt0=0.5)
+        .clouds[-1]
+        .points
+    )
+    both = jax.jit(jax.vmap(end))(jnp.array([0.5, 0.25]))
+    np.testing.assert_allclose(both, [1.5 * CLOUD.points, 1.25 * CLOUD.points], atol=1e-12)
+    single = js.PointCloud(*(a.astype(jnp.float32) for a in (CLOUD.points, CLOUD.normals)))
+    options = dict(args=np.float32(0.5), method=SURFACE.method, solver=dfx.Heun(), dt0=0.5)
+    found = js.evolve(js.Motion(growing), single, t1=1.0, **options).clouds[-1].points
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, 1.5 * CLOUD.points, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_compiled_motion_that_outruns_its_neighbours_is_an_error():
+    flat = lambda t, surface, fields, args: args * surface.cloud.points * jnp.array([0, 0, -1.0])
+    end = lambda rate: (
+        js.evolve(js.Motion(flat), SURFACE, t1=1.0, args=rate, solver=dfx.Heun(), dt0=0.1)
+        .clouds[-1]
+        .points
+    )
+    with pytest.raises(Exception, match="does not keep the neighbours"):
+        jax.block_until_ready(jax.jit(end)(jnp.asarray(4.0)))
+
+
+@pytest.mark.core
+def test_a_rigid_motion_and_what_is_saved():
+    """Rotation about an axis: points and normals to the tolerance of the steps; other numbers."""
+    axis = jnp.array([1.0, 0.0, 1.0])
+    spin = lambda t, surface, fields, args: args * jnp.cross(axis, surface.cloud.points)
+    run = lambda speed, **options: js.evolve(
+        js.Motion(spin), SURFACE, t1=np.pi / 2**0.5, fields=Z, args=speed, rtol=1e-8, **options
+    )
+    found = run(1.0, saveat=[0.0, 0.5])
+    assert found.ts.tolist() == [0.0, 0.5, np.pi / 2**0.5]
+    half = 2 * np.outer(axis, axis) / 2 - np.eye(3)  # by half a turn
+    np.testing.assert_allclose(found.clouds[-1].points, CLOUD.points @ half.T, atol=1e-6)
+    np.testing.assert_allclose(found.clouds[-1].normals, CLOUD.normals @ half.T, atol=1e-6)
+    np.testing.assert_array_equal(found.clouds[0].points, CLOUD.points)
+    assert bool(jnp.all(found.fields[-1] == Z)) and found.stats["renewals"] == 0
+    assert "200 points" in repr(found) and "Tsit5" in repr(found)
+    solver = found.stats["solver"]
+    assert solver.startswith("Tsit5")
+    back = run(-1.0).clouds[-1].points
+    np.testing.assert_allclose(back, CLOUD.points @ half.T, atol=1e-6)

@@ -323,6 +323,18 @@ def diffused(c: Case, **options):
     return evolved(c, problem, **options)
 
 
+def carried(c: Case):
+    """Heat on a surface that grows and shears."""
+    shear = lambda t, surface, fields, args: surface.cloud.points * surface.cloud.points[:, :1]
+    heat = lambda surface: js.AdvectionDiffusionReaction(surface.laplacian)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = js.evolve(
+            js.Motion(shear), c.surface, fields=c.u, problem=heat, solver=dfx.Heun(), **QUICK
+        )
+    return found.clouds[-1].points[c.rows], found.fields[-1]
+
+
 def adapted(c: Case, **options):
     problem = js.AdvectionDiffusionReaction(c.laplacian, reaction=lambda t, u, args: 1 - u)
     found = js.integrate(problem, c.u, t1=0.05, **options)
@@ -500,6 +512,7 @@ TABLE = {
     "SDIRK": Row(lambda c: diffused(c, solver=js.SDIRK(order=3)), SOLVED),
     "controller": Row(lambda c: adapted(c, solver=dfx.Tsit5(), atol=0.0), SOLVED, core=True),
     "AdvectionDiffusionReaction": Row(advected),
+    "evolve": Row(carried, SOLVED),
     "BiharmonicDiffusion": Row(
         lambda c: evolved(c, js.BiharmonicDiffusion(c.laplacian), solver=js.IMEX(order=2)), SOLVED
     ),
@@ -537,6 +550,8 @@ BESIDE = {
     "PointCloud": "find_neighbors", "Neighbors": "find_neighbors",
     "AbstractOperator": "Stencil", "AbstractMethod": "laplace_beltrami",
     "AbstractPreconditioner": "jacobi", "AbstractEvolution": "integrate",
+    "Motion": "evolve", "AbstractMotion": "evolve", "MeanCurvatureFlow": "evolve",
+    "Evolution": "evolve",
 }  # fmt: skip
 
 # Take bare points, of which none can be switched off, or none at all.

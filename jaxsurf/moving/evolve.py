@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from ..arguments import as_float, finite, instance, real
+from ..arguments import as_float, finite, instance, real, switched_off
 from ..cloud import PointCloud
 from ..discretization import Discretization, discretize
 from ..failures import is_concrete, raise_at, refuse
@@ -144,7 +144,9 @@ def evolve(
     """
     surface = _discretized(checked_motion(motion), cloud, method)
     n = surface.n
-    fields = jax.tree.map(lambda u: finite(as_float(u, "fields", (n, ...)), "fields"), fields)
+    on = surface.cloud.active
+    field = lambda u: finite(switched_off(on, as_float(u, "fields", (n, ...))), "fields")
+    fields = jax.tree.map(field, fields)
     times = _times(t0, t1, saveat)
     if problem is not None:
         if not callable(problem) or isinstance(problem, AbstractEvolution):

@@ -8,9 +8,10 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ..arguments import as_float
+from ..arguments import as_float, instance
 from ..discretization import Discretization
 from ..stencils.algebra import AbstractOperator
 
@@ -93,7 +94,10 @@ class MeanCurvatureFlow(AbstractMotion):
         True
     """
 
-    keep_volume: bool = eqx.field(static=True, default=False)
+    keep_volume: bool = eqx.field(static=True)
+
+    def __init__(self, keep_volume: bool = False):
+        self.keep_volume = bool(instance(keep_volume, (bool, np.bool_), "keep_volume"))
 
     @property
     def stiff(self):

@@ -67,11 +67,11 @@ class Moving(AbstractEvolution):
         surface = self.surface_at(points)
         velocity = self.motion.velocity(t, surface, fields, args)
         if self.on is None:
-            return joined(velocity, jax.tree.map(jnp.zeros_like, fields))
+            return self._free(joined(velocity, jax.tree.map(jnp.zeros_like, fields)))
         problem = self.on(surface)
         dilution = problem.dilution(fields, surface.divergence(velocity))
         change = problem.rate(t, fields, args)
-        return joined(velocity, jax.tree.map(jnp.add, change, dilution))
+        return self._free(joined(velocity, jax.tree.map(jnp.add, change, dilution)))
 
     def at(self, t, u):
         surface = self.surface_at(u[0])

@@ -1,0 +1,62 @@
+"""Surfaces that move."""
+
+# One case a line reads as a table.
+# ruff: noqa: E501
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+
+import jaxsurf as js
+
+from . import Case
+
+N = 60
+
+
+@functools.cache
+def surface() -> js.Discretization:
+    cloud = js.sphere(N)
+    return js.discretize(cloud, js.find_neighbors(cloud, k=36), method=js.GFDM(degree=2))
+
+
+def still(t, surface, fields, args):
+    return 0 * surface.cloud.points
+
+
+def evolve(motion=None, cloud=None, **options):
+    motion = js.Motion(still) if motion is None else motion
+    return js.evolve(motion, surface() if cloud is None else cloud, **({"t1": 1.0} | options))
+
+
+def heat(surface):
+    return js.AdvectionDiffusionReaction(surface.laplacian)
+
+
+CALLS = [
+    ("evolve", "a bare function", lambda: evolve(still), ("motion", "function", "js.Motion")),
+    ("evolve", "bare points", lambda: evolve(cloud=surface().cloud.points), ("cloud", "PointCloud")),
+    ("evolve", "a method for a surface that has one", lambda: evolve(method=js.GFDM(degree=4)), ("method", "GFDM(degree=4)")),
+    ("evolve", "fields of others", lambda: evolve(fields=jnp.ones(70)), ("fields", "(70,)", "60")),
+    ("evolve", "a field that is not finite", lambda: evolve(fields=jnp.ones(N).at[7].set(np.nan)), ("fields", "7")),
+    ("evolve", "a complex field", lambda: evolve(fields=1j * jnp.ones(N)), ("fields", "complex")),
+    ("evolve", "a problem in place of a function", lambda: evolve(fields=jnp.ones(N), problem=heat(surface())), ("problem", "function", "surface")),
+    ("evolve", "a function of no problem", lambda: evolve(fields=jnp.ones(N), problem=lambda s: s.laplacian), ("problem", "Stencil")),
+    ("evolve", "an end before the start", lambda: evolve(t1=-1.0), ("t1", "-1", "0")),
+    ("evolve", "an end that is text", lambda: evolve(t1="1"), ("t1", "'1'")),
+    ("evolve", "saves out of order", lambda: evolve(saveat=[0.5, 0.2]), ("saveat", "0.5")),
+    ("evolve", "saves after the end", lambda: evolve(saveat=[0.5, 2.0]), ("saveat", "2", "1")),
+    ("evolve", "a save that is text", lambda: evolve(saveat=["0.5"]), ("saveat", "'0.5'")),
+    ("evolve", "a solver as text", lambda: evolve(solver="heun"), ("solver", "heun")),
+    ("evolve", "a tolerance of one", lambda: evolve(rtol=1.0), ("rtol", "1")),
+    ("Motion", "an array", lambda: js.Motion(np.ones((N, 3))), ("velocity", "ndarray", "function")),
+    ("Motion", "nothing", lambda: js.Motion(None), ("velocity", "None", "function")),
+    ("Motion", "velocities of one component", lambda: evolve(js.Motion(lambda t, s, f, a: s.cloud.points[:, 0])), ("velocity", "(60,)", "(60, 3)")),
+    ("Motion", "a velocity that is a list", lambda: evolve(js.Motion(lambda t, s, f, a: [1.0, 0.0, 0.0])), ("velocity", "(60, 3)")),
+    ("MeanCurvatureFlow", "text", lambda: js.MeanCurvatureFlow(keep_volume="yes"), ("keep_volume", "yes")),
+    ("MeanCurvatureFlow", "a number", lambda: js.MeanCurvatureFlow(keep_volume=1.0), ("keep_volume", "1.0")),
+    ("MeanCurvatureFlow", "a cloud", lambda: js.MeanCurvatureFlow(surface().cloud), ("keep_volume", "PointCloud")),
+]  # fmt: skip
+
+CASES = [Case(*case) for case in CALLS]

@@ -1,0 +1,50 @@
+"""Surfaces that move."""
+
+from . import Entry
+
+_M = "test_moving.py::"
+_HEAT = _M + "test_solvers_keep_their_order_though_the_geometry_moves"
+_SLOPES, _MAPPED = (
+    _M + "test_derivatives_through_the_motion",
+    _M + "test_mapped_and_in_single_precision",
+)
+_OUTRUN = _M + "test_a_compiled_motion_that_outruns_its_neighbours_is_an_error"
+_SHRUNK = _M + "test_a_sphere_shrinks_by_its_curvature"
+
+TESTED: dict[str, dict[str, Entry]] = {
+    "evolve": {
+        "value": f"{_HEAT}, {_M}test_a_rigid_motion_and_what_is_saved, "
+        f"{_M}test_neighbours_are_found_anew_where_a_surface_is_sheared, "
+        f"{_M}test_waves_are_diluted_in_their_velocity",
+        "gradient": {"points": _SLOPES, "fields": _SLOPES, "args": _SLOPES},
+        "jit": _SLOPES,
+        "vmap": _MAPPED,
+        "float32": _MAPPED,
+        "bad input": f"malformed, {_OUTRUN}",
+    },
+    "Evolution": {
+        "value": f"{_M}test_a_rigid_motion_and_what_is_saved, "
+        f"{_M}test_an_ellipsoid_that_keeps_its_volume_loses_area",
+        "gradient": {"points": _SLOPES},
+        "jit": _SLOPES,
+        "vmap": _MAPPED,
+        "float32": _MAPPED,
+        "bad input": "(returned, not made)",
+    },
+    "Motion": {
+        "value": _HEAT,
+        "gradient": {"args": _SLOPES},
+        "jit": _SLOPES,
+        "vmap": _MAPPED,
+        "float32": _MAPPED,
+        "bad input": "malformed",
+    },
+    "MeanCurvatureFlow": {
+        "value": f"{_SHRUNK}, {_M}test_an_ellipsoid_that_keeps_its_volume_loses_area",
+        "gradient": "(made of operators, whose derivatives are tested)",
+        "jit": "(made of operators, as the velocities of Motion are)",
+        "vmap": "(made of operators, as the velocities of Motion are)",
+        "float32": "(made of operators, as the velocities of Motion are)",
+        "bad input": "malformed",
+    },
+}  # fmt: skip

@@ -36,18 +36,17 @@ def exact(eigenvalue, t=1.0, rate=RATE):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order, least", [(2, 1.9), (3, 2.7)])
-def test_solvers_keep_their_order_though_the_geometry_moves(order, least):
-    """Steps halved twice; the eigenvalue is that of the stencils, so that only time is judged."""
+def test_solvers_keep_their_order_though_the_geometry_moves():
+    """Steps halved; the eigenvalue is that of the stencils, so that only time is judged."""
     eigenvalue = float(jnp.vdot(X * Y, SURFACE.laplacian(X * Y)) / jnp.vdot(X * Y, X * Y))
     errors = []
     for steps in (16, 32):
-        end = grown(solver=js.IMEX(order=order), dt0=1 / steps)
+        end = grown(solver=js.IMEX(order=3), dt0=1 / steps)
         factor = float(jnp.vdot(X * Y, end.fields[-1]) / jnp.vdot(X * Y, X * Y))
         errors.append(abs(factor / exact(eigenvalue) - 1))
         radius = jnp.linalg.norm(end.clouds[-1].points, axis=1)
         assert float(jnp.abs(radius - 1.5).max()) < 1e-10
-    assert np.log2(errors[0] / errors[1]) > least and errors[1] < 1e-3
+    assert np.log2(errors[0] / errors[1]) > 2.7 and errors[1] < 1e-3
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from .arguments import as_float, finite, instance, mask, real, whole
-from .failures import is_concrete
+from .failures import is_concrete, unchecked
 from .neighbors import Neighbors
 from .sheets import cosine_slack
 
@@ -244,7 +244,7 @@ def _search(
         candidates_needed=needed.max(),
         point=jnp.where(needed.max() > capacity.candidates, jnp.argmax(needed), jnp.argmax(count)),
     )
-    neighbors = Neighbors(indices, mask, radius if k is None else None)
+    neighbors = unchecked(Neighbors, indices, mask, radius if k is None else None)
     if throw:
         neighbors = eqx.error_if(
             neighbors,

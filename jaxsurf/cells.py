@@ -164,6 +164,7 @@ def search_neighbors(
         Neighbour lists with `capacity.k` slots (or k), and what was needed and available. If
         `report.overflow`, neighbours are missing; `report.check()` gives the numbers.
 
+    Accuracy: in float32 the lists of `find_neighbors` (`tests/test_neighbors.py`).
     Differentiable: the lists are integers; no derivative flows through the search.
     Raises:
         TypeError: points, numbers or a capacity that are none.

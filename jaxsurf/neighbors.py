@@ -151,6 +151,7 @@ def find_neighbors(
         Neighbour lists. A row that has fewer than k acceptable points among its 8 k nearest
         is padded, with mask False.
 
+    Accuracy: in float32 as in double precision where distances tie (`tests/test_neighbors.py`).
     Differentiable: the lists are integers; operators are differentiable for fixed lists. Under
     `grad` they are those of the values that are differentiated.
     Raises:

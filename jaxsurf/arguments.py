@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .failures import check, is_concrete, needs_values, not_finite, raise_at
+from .failures import check, is_concrete, needs_values, not_finite, raise_at, refuse
 
 
 def as_float(x: Any, name: str = "array", *shapes: tuple) -> Float[Array, "..."]:
@@ -237,8 +237,10 @@ def indices_of(where: Any, n: int | None, name: str) -> Int[np.ndarray, " m"]:
     return given.astype(np.int32)
 
 
-def point_indices(indices: Any, name: str, *, axes: str, n: int) -> None:
-    """Check an array of indices of points, whose points run along its axis `n` (0 or -1).
+def point_indices(indices: Any, name: str, *, axes: str, n: int) -> Any:
+    """An array of indices of points, whose points run along its axis `n` (0 or -1), checked.
+
+    Under `jit` and `vmap` an index that is no point is an error when the program runs.
 
     Raises:
         TypeError: not of an integer type.
@@ -252,7 +254,8 @@ def point_indices(indices: Any, name: str, *, axes: str, n: int) -> None:
     points = np.arange(count).reshape((-1, 1) if n == 0 else (1, -1))
     points = np.broadcast_to(points, indices.shape)
     text = f"{name} of point {{i}} name point {{v}}, there are {count}"
-    check(indices, lambda x: (x < 0) | (x >= count), text, points=points)
+    wide = indices.astype(jnp.promote_types(indices.dtype, jnp.int32))
+    return refuse(indices, (wide < 0) | (wide >= count), text, indices, points=points)
 
 
 # Shapes of points and of vectors at them.

@@ -16,7 +16,14 @@ from .arguments import as_many, instance
 from .arguments import mask as checked_mask
 from .cloud import PointCloud
 from .compiling import at_once, copying_jit, namespace, sized_jit
-from .failures import is_concrete, needs_values, raise_at, refuse, without_derivatives
+from .failures import (
+    is_concrete,
+    needs_values,
+    raise_at,
+    refuse,
+    unchecked,
+    without_derivatives,
+)
 from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .neighbors import Neighbors, Rows, find_neighbors, nearest_of, switched_on
 from .stencils.dcpse import DCPSE
@@ -101,7 +108,7 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     # Lists that are known stay known in compiled code: transposes can gather there.
     with at_once() if is_concrete(neighbors.indices) else nullcontext():
         slots = _slots_first(neighbors.indices)
-    stencil = Stencil(slots, values, components, (), *known)
+    stencil = unchecked(Stencil, slots, values, components, (), *known)
     if throw and is_concrete(values):
         _check(stencil, neighbors, method, target, cloud.dim)
     return stencil

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from .arguments import as_float, finite, instance, mask, real, whole
-from .failures import is_concrete
+from .failures import is_concrete, unchecked
 from .neighbors import Neighbors
 from .sheets import cosine_slack
 
@@ -164,6 +164,7 @@ def search_neighbors(
         Neighbour lists with `capacity.k` slots (or k), and what was needed and available. If
         `report.overflow`, neighbours are missing; `report.check()` gives the numbers.
 
+    Accuracy: in float32 the lists of `find_neighbors` (`tests/test_neighbors.py`).
     Differentiable: the lists are integers; no derivative flows through the search.
     Raises:
         TypeError: points, numbers or a capacity that are none.
@@ -244,7 +245,7 @@ def _search(
         candidates_needed=needed.max(),
         point=jnp.where(needed.max() > capacity.candidates, jnp.argmax(needed), jnp.argmax(count)),
     )
-    neighbors = Neighbors(indices, mask, radius if k is None else None)
+    neighbors = unchecked(Neighbors, indices, mask, radius if k is None else None)
     if throw:
         neighbors = eqx.error_if(
             neighbors,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import os
 import sys
 import threading
 import time
@@ -240,6 +241,7 @@ def report(result: demo.Demo) -> list[str]:
     lines += [f"  {stage:<15}{c:8.1f}{r:8.1f}" for stage, (c, r) in result.seconds.items()]
     c, r = (sum(spent) for spent in zip(*result.seconds.values()))
     lines += [f"  {'total':<15}{c:8.1f}{r:8.1f}"]
+    lines += ["", f"done in {c + r:.1f} s on {os.cpu_count()} cores"]
     if not result.stable:
         lines += [
             "",

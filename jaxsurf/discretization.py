@@ -336,7 +336,9 @@ def discretize(
     Returns:
         The surface, with its operators, curvatures and integrals.
 
-    Accuracy: of each part as its own function has it; integrals see `Discretization.areas`.
+    Accuracy: of each part as its own function has it; integrals see `Discretization.areas`. In
+    float32 areas and interpolated values are within 1e-5 on 500 points, gradients of integrals in
+    the points within 1 % (`tests/test_discretization.py`, `tests/test_forms.py`).
     Differentiable: forward and reverse, in points and normals, for fixed neighbours.
     Raises:
         TypeError: no cloud, neighbours or method.

@@ -7,6 +7,7 @@ the one needed. Elsewhere the result carries a code (`Diagnostics`, `Discretizat
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Callable
 from typing import Any
@@ -119,6 +120,20 @@ def refuse(x: Any, bad: Array, message: str, values: Any = None, **how: Any) -> 
         return x
     message = message.replace("{more}", "")
     return eqx.error_if(x, bad, re.sub(r"\{\w+[^}]*\}", "(to be seen outside jit)", message))
+
+
+def unchecked(cls: type, *values: Any, **named: Any) -> Any:
+    """A module of fields that are known to be sound, none of which is looked at again.
+
+    What a constructor cannot see in compiled code it leaves to the program (`refuse`), which
+    takes time to compile: lists that were checked when they were made need none of it.
+    """
+    fields = dataclasses.fields(cls)
+    given = {field.name: value for field, value in zip(fields, values)} | named
+    made: Any = object.__new__(cls)
+    for field in fields:
+        object.__setattr__(made, field.name, given.get(field.name, field.default))
+    return made
 
 
 def not_positive(x: Any) -> Any:

@@ -42,9 +42,8 @@ def read(
 ) -> PointCloud:
     """Point cloud from a triangle mesh or a list of points.
 
-    OBJ, OFF and XYZ (columns `x y z` or `x y z nx ny nz`; `x y` or `x y nx ny` for curves in the
-    plane) need no other package; PLY, STL, VTK and VTU need `pip install 'jaxsurf[files]'`.
-    Columns of an XYZ file are taken for normals only where all have length one.
+    OBJ, OFF and XYZ (columns `x y z`, or `x y` for curves in the plane; others must be named) need
+    no other package; PLY, STL, VTK and VTU need `pip install 'jaxsurf[files]'`.
 
     Normals are those in the file, scaled to length one. A mesh without them gives the side they
     point to by the order of its corners, and their direction comes from local polynomial fits
@@ -65,7 +64,8 @@ def read(
         seed: of resampling.
         columns: of an XYZ file, by name: x, y, z, nx, ny, nz, and any other name for a field
             (see `read_fields`); as in 'x y z r g b'. If None, those that a first comment names
-            (`# x y z value`), or else what their number and the lengths of the normals say.
+            (`# x y z nx ny nz`, as `write` leaves it), or else two or three coordinates: more
+            columns without names are an error, as unit vectors may be colours too.
         faces: False takes the vertices of a mesh as a list of points, whatever its faces.
         largest_part: leave out faces until no edge has more than two, see `clean_mesh`.
 
@@ -79,7 +79,7 @@ def read(
         ValueError: the file is empty, truncated, of unknown kind or has no points; vertex
             numbers out of range, non-finite coordinates, zero normals, coinciding points of a
             cloud (named by index); edges of more than two triangles; a surface with one side
-            only; too few points; columns that may be anything. The message begins with the path.
+            only; too few points; columns that nothing names. The message begins with the path.
         TypeError: an argument of the wrong kind.
         ImportError: meshio is needed and absent.
 

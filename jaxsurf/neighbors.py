@@ -12,7 +12,16 @@ from scipy.spatial import cKDTree
 from .arguments import POINTS, as_float, finite, is_array, point_indices, real, shaped, whole
 from .checks import check_count, check_orientation, check_overlap, check_spacing, two_sheets
 from .cloud import PointCloud
-from .failures import check, is_concrete, needs_values, not_positive, raise_at, without_derivatives
+from .failures import (
+    check,
+    is_concrete,
+    needs_values,
+    not_positive,
+    raise_at,
+    refuse,
+    unchecked,
+    without_derivatives,
+)
 from .sheets import distance_key, judge, nearest, without_islands
 
 
@@ -30,8 +39,9 @@ class Neighbors(eqx.Module):
 
     Raises:
         TypeError: indices that are not integers, a mask that is not bool.
-        ValueError: shapes that do not fit; on concrete arrays also an index that is no point, a
-            slot 0 that is not the point itself, a mask that leaves nothing.
+        ValueError: shapes that do not fit; an index that is no point, a slot 0 that is not the
+            point itself (both in compiled code too, when it runs); on concrete arrays a mask that
+            leaves nothing.
 
     Example:
         >>> neighbors = js.find_neighbors(js.sphere(300), k=12)
@@ -50,15 +60,15 @@ class Neighbors(eqx.Module):
                 if isinstance(value, list | tuple | str | int | float | None.__class__):
                     raise TypeError(f"{name} is a {type(value).__name__}, expected an array (n, k)")
             return  # a pytree of something else, as transformations make them
-        point_indices(self.indices, "indices", axes="(n, k)", n=0)
+        indices = point_indices(self.indices, "indices", axes="(n, k)", n=0)
         if self.mask.dtype != bool:
             raise TypeError(f"mask is {self.mask.dtype}, expected bool")
-        shaped(self.mask, "mask", self.indices.shape)
-        if is_concrete(self.indices, self.mask):
-            first, used = np.asarray(self.indices)[:, 0], np.asarray(self.mask)
-            raise_at(
-                first != np.arange(self.n), "slot 0 of row {i} names point {v}, expected {i}", first
-            )
+        shaped(self.mask, "mask", indices.shape)
+        first, text = indices[:, 0], "slot 0 of row {i} names point {v}, expected {i}"
+        indices = refuse(indices, first != np.arange(self.n), text, first)
+        object.__setattr__(self, "indices", indices)  # with the errors of compiled code
+        if is_concrete(indices, self.mask):
+            used = np.asarray(self.mask)
             if not used.any():
                 raise ValueError(f"mask is False in all {used.size} slots: no point has neighbours")
             raise_at(
@@ -141,6 +151,7 @@ def find_neighbors(
         Neighbour lists. A row that has fewer than k acceptable points among its 8 k nearest
         is padded, with mask False.
 
+    Accuracy: in float32 as in double precision where distances tie (`tests/test_neighbors.py`).
     Differentiable: the lists are integers; operators are differentiable for fixed lists. Under
     `grad` they are those of the values that are differentiated.
     Raises:
@@ -269,7 +280,7 @@ def switched_on(cloud: PointCloud, neighbors: Neighbors) -> Neighbors:
     if cloud.active is None or neighbors.n != cloud.n:
         return neighbors
     mask = _used(cloud.active, neighbors.indices, neighbors.mask)
-    return Neighbors(neighbors.indices, mask, neighbors.radius)
+    return unchecked(Neighbors, neighbors.indices, mask, neighbors.radius)
 
 
 @jax.jit

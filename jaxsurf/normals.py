@@ -48,7 +48,8 @@ def from_points(
         The points, in the order given, with the normals from `estimate_normals`.
 
     Accuracy: as `estimate_normals`.
-    Not differentiable, as `estimate_normals`.
+    Not differentiable, as `estimate_normals`. In float32 normals are within 2e-5 on 1,000 points of
+    a sphere (`tests/test_frames.py`).
     Raises:
         ValueError, TypeError: as `estimate_normals`; a `boundary` that is no mask of n points.
 

@@ -2,6 +2,8 @@ r"""Differential operators on point clouds: on surfaces, and in flat space."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,7 @@ from jaxtyping import Array, Float
 from .arguments import POINTS, as_float, finite, instance, switched_off, whole
 from .build import build
 from .cloud import PointCloud
-from .failures import is_concrete, raise_at
+from .failures import is_concrete, refuse, without_derivatives
 from .neighbors import Neighbors, find_neighbors
 from .stencils.algebra import Composition
 from .stencils.dcpse import DCPSE, FlatDCPSE
@@ -83,7 +85,8 @@ def surface_gradient(
 
     Accuracy: error $O(h^r)$ for `DCPSE(order=r)`, $O(h^p)$ for `GFDM(degree=p)` and
     `RBFFD(degree=p)`; in float32 round-off is amplified by 1/h
-    (`tests/test_forms.py::test_single_precision`).
+    (`tests/test_forms.py::test_single_precision`). Values are then within 2e-4 of the largest on
+    200 points, gradients in the points within 1 %.
     Differentiable: forward and reverse, in points, normals and field, for fixed neighbours.
     Raises:
         ValueError: as `laplace_beltrami`.
@@ -116,7 +119,8 @@ def surface_divergence(
     Returns:
         Operator mapping `(n, *c, d)` fields to `(n, *c)`, in units of field / length.
 
-    Accuracy: as `surface_gradient`.
+    Accuracy: as `surface_gradient`. In float32 values are within 2e-4 of the largest on 200 points,
+    gradients in the points within 1 % (`tests/test_forms.py`).
     Differentiable: forward and reverse, in points, normals and field, for fixed neighbours.
     Raises:
         ValueError: as `laplace_beltrami`.
@@ -151,7 +155,8 @@ def directional_derivative(
     Returns:
         Operator mapping `(n, *c)` fields to the same shape.
 
-    Accuracy: as `surface_gradient`.
+    Accuracy: as `surface_gradient`. In float32 values are within 2e-4 of the largest on 200 points,
+    gradients in the points within 1 % (`tests/test_forms.py`).
     Differentiable: forward and reverse, in points, normals, direction and field.
     Raises:
         ValueError: as `laplace_beltrami`; a direction of the wrong shape or not finite.
@@ -200,12 +205,14 @@ def diffusion(
     Returns:
         Operator mapping `(n, *c)` fields to the same shape.
 
-    Accuracy: the order of the Laplace–Beltrami operator of the same method.
+    Accuracy: the order of the Laplace–Beltrami operator of the same method. In float32 values are
+    within 2e-4 of the largest on 200 points, gradients in the points within 1 %
+    (`tests/test_forms.py`).
     Differentiable: forward and reverse, in points, normals, diffusivity and field.
     Raises:
-        ValueError: as `laplace_beltrami`; a diffusivity of the wrong shape; a concrete one that
-            is not finite, negative, not symmetric or not positive semidefinite (point and number
-            given).
+        ValueError: as `laplace_beltrami`; a diffusivity of the wrong shape, or one that is not
+            finite, negative, not symmetric or not positive semidefinite (point and number given;
+            in compiled code when it runs).
 
     Example:
         >>> cloud = js.sphere(500)
@@ -226,22 +233,23 @@ def _checked_diffusivity(diffusivity, cloud) -> Float[Array, "*n"]:
     n, dim = cloud.points.shape
     d = as_float(diffusivity, "diffusivity", (n,), (n, dim, dim))
     finite(d, "diffusivity", cloud.active)
-    if not is_concrete(d, cloud.active):
-        return d
-    on = cloud.host_active
-    values = np.where(np.expand_dims(on, tuple(range(1, d.ndim))), np.asarray(d), 0)
+    seen, active = without_derivatives(d), cloud.active
+    known = is_concrete(seen, active)
+    xp: Any = np if known else jnp
+    seen = seen if known else jax.lax.stop_gradient(d)
+    values = xp.asarray(seen)
+    if active is not None:
+        values = xp.where(xp.reshape(active, (n, *[1] * (d.ndim - 1))), values, 0)
     if d.ndim == 1:
-        raise_at(on & (values < 0), "diffusivity of point {i} is {v}, expected at least 0", values)
-        return d
-    size = np.abs(values).max(axis=(1, 2))
-    slack = 1e3 * np.finfo(values.dtype).eps * size
-    skew = np.abs(values - values.swapaxes(1, 2)).max(axis=(1, 2))
+        text = "diffusivity of point {i} is {v}, expected at least 0"
+        return refuse(d, ~(xp.isfinite(values) & (values >= 0)), text, values)
+    slack = 1e3 * np.finfo(values.dtype).eps * xp.abs(values).max(axis=(1, 2))
+    skew = xp.abs(values - values.swapaxes(1, 2)).max(axis=(1, 2))
     text = "diffusivity of point {i} is not symmetric: entries differ by {v:.3g}, expected 0"
-    raise_at(on & (skew > slack), text, skew)
-    least = np.linalg.eigvalsh(values)[:, 0]
+    d = refuse(d, ~(skew <= slack), text, skew)
+    least = xp.linalg.eigvalsh(values)[:, 0]
     text = "diffusivity of point {i} has the eigenvalue {v:.3g}, expected at least 0"
-    raise_at(on & (least < -slack), text, least)
-    return d
+    return refuse(d, ~(least >= -slack), text, least)
 
 
 @jax.jit
@@ -325,7 +333,8 @@ def partial_derivative(
         Operator mapping `(n, *c)` fields to the same shape, in units of
         field / length^|alpha|.
 
-    Accuracy: error $O(h^r)$ in the interior and at borders (`tests/test_flat.py`).
+    Accuracy: error $O(h^r)$ in the interior and at borders (`tests/test_flat.py`). In float32
+    within 1e-4 on 81 points, for values of size one (`tests/test_forms.py`).
     Differentiable: forward and reverse, in points and field, for fixed neighbours.
     Raises:
         ValueError: as `laplace_beltrami`; an alpha that is no multi-index of length d ≥ 1.

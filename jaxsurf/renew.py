@@ -23,6 +23,7 @@ from .build import stencil_weights
 from .cells import all_on, distance_key
 from .checks import DETOUR, LINK, RINGS, ring_size
 from .cloud import PointCloud
+from .failures import unchecked
 from .nearest import Grid, Nearest, nearest_in
 from .neighbors import Neighbors, Rows
 from .sheets import cosine_slack
@@ -281,7 +282,7 @@ def _padded(lists: _Lists, before: Neighbors, slots: int) -> Neighbors:
     fitted = lambda indices, mask: (_wide(indices, slots, own).T, _wide(mask, slots, False).T)
     good = (lists.code == 0)[:, None]
     new, old = fitted(lists.indices, lists.mask), fitted(before.indices.T, before.mask.T)
-    return Neighbors(*(jnp.where(good, a, b) for a, b in zip(new, old)))
+    return unchecked(Neighbors, *(jnp.where(good, a, b) for a, b in zip(new, old)))
 
 
 def _wide(a, slots: int, value):

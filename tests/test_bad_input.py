@@ -1,5 +1,7 @@
 """Misuse and degenerate points: named, with the number there was and the number needed."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -115,3 +117,38 @@ def test_settings_that_make_no_sense():
         js.diffusion(SPHERE, jnp.ones((300, 2)))
     with pytest.raises(ValueError, match="direction has shape"):
         js.directional_derivative(SPHERE, jnp.ones((300, 2)))
+
+
+@pytest.mark.parametrize(
+    "bad,text", [((5, 3, 300), "name point"), ((5, 3, -1), "name point"), ((5, 0, 6), "slot 0")]
+)
+def test_traced_indices_that_are_no_points(bad, text):
+    """Where they are traced the program raises; programs on lists that exist look at none again."""
+    cloud = js.sphere(300)
+    found = js.find_neighbors(cloud, k=15)
+    row, slot, value = bad
+    wrong = found.indices.at[row, slot].set(value)
+    given = jnp.ones(300)
+
+    @eqx.filter_jit
+    def apply(indices):
+        neighbors = js.Neighbors(indices, found.mask)
+        return js.laplace_beltrami(cloud, neighbors, throw=False)(given)
+
+    @eqx.filter_jit
+    def total(indices):
+        return js.Stencil(indices.T, jnp.ones((15, 300)))(given)
+
+    np.testing.assert_allclose(total(found.indices), 15)
+    assert jnp.abs(apply(found.indices)).max() < 1e-10
+    with pytest.raises(eqx.EquinoxRuntimeError, match=text):
+        apply(wrong)
+    if text == "name point":
+        with pytest.raises(eqx.EquinoxRuntimeError, match=text):
+            total(wrong)
+        with pytest.raises(eqx.EquinoxRuntimeError, match=text):
+            eqx.filter_jit(jax.vmap(total))(jnp.stack([found.indices, wrong]))
+
+    known = eqx.filter_jit(lambda n, c: js.laplace_beltrami(c, n, throw=False)(given))
+    assert "callback" in apply.lower(wrong).as_text()
+    assert "callback" not in known.lower(found, cloud).as_text()

@@ -58,6 +58,9 @@ def test_demo(tmp_path, capsys):
     code, report, err = run(capsys, "--points", 3_000, "--out", tmp_path)
     assert code == 0 and stages_told(err) == list(demo.STAGES)
     assert "points           3,000" in report
+    # How long it took, in all and by stages.
+    took = float(re.search(r"\ndone in ([\d.]+) s on \d+ cores", report)[1])
+    assert took == pytest.approx(sum(map(float, line(report, "  total").split()[1:])), abs=0.2)
     assert "GFDM(degree=4)" in line(report, "method")
     assert number(report, "heat conserved", "to") < 5e-3
     assert number(report, "  difference", "relative difference") < 1e-6

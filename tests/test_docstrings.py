@@ -4,13 +4,17 @@ import doctest
 import importlib
 import inspect
 import pkgutil
+import re
 
+import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxsurf as js
+
+from .tested import tables, tests_of
 
 pytestmark = pytest.mark.slow
 
@@ -29,6 +33,33 @@ def test_every_public_name_has_an_example():
     assert len(public) > 80
     without = [name for name, value in public.items() if ">>> " not in (value.__doc__ or "")]
     assert not without
+
+
+# What has no error of its own: choices, conditions, files, pictures, exact points.
+_EXACT = {
+    *("choose_neighbors", "allocate_search", "choose_solver", "identity", "sort_cloud"),
+    *("dirichlet", "neumann", "robin", "free", "find_border", "detect_boundary"),
+    *("read", "read_fields", "write", "plot_cloud", "plot_fields", "clean_mesh", "sample_mesh"),
+    *("circle", "sphere", "ellipsoid", "graph", "surface_of_revolution", "poisson_disk"),
+    *("double_torus", "jacobi", "AbstractEvolution"),
+}
+
+
+@pytest.mark.core
+def test_accuracy_in_single_precision_is_stated():
+    """Of every function with a test of it, and of solvers and problems in time."""
+    kinds = (js.AbstractEvolution, dfx.AbstractSolver)
+    rows = {name: row for table in tables().values() for name, row in table.items()}
+    public = {name: getattr(js, name) for name, row in rows.items() if tests_of(row["float32"])}
+    asked = {
+        name: value.__doc__
+        for name, value in public.items()
+        if inspect.isfunction(value) or (inspect.isclass(value) and issubclass(value, kinds))
+    }
+    unsaid = {
+        name for name, text in asked.items() if not re.search(r"float32|single\s+precision", text)
+    }
+    assert len(asked) > 60 and unsaid <= _EXACT, unsaid - _EXACT
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -1,5 +1,6 @@
 """The command line of the experiments, and that a bound that is not kept is seen."""
 
+import inspect
 import json
 import math
 import subprocess
@@ -14,6 +15,7 @@ from experiments import __main__ as command
 from experiments import e01_circle_laplacian as e01
 from experiments import e06_ellipsoid_curvature as e06
 from experiments import surfaces
+from experiments.benchmarks import prompt
 from experiments.report import Row, slope, table
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -97,3 +99,12 @@ def test_the_grid_of_the_ellipsoid_has_the_published_number_of_points():
     exact = js.level_set_curvature(surfaces.ellipsoid().phi, cloud.points)
     np.testing.assert_allclose(mean, exact[0], rtol=1e-12)
     np.testing.assert_allclose(gauss, exact[1], rtol=1e-12)
+
+
+@pytest.mark.core
+def test_first_calls_of_all_public_functions_are_timed():
+    """The README's claim is about all of them."""
+    timed = inspect.getsource(prompt)
+    functions = [name for name, value in vars(js).items() if inspect.isfunction(value)]
+    assert len(functions) > 60
+    assert not [name for name in functions if f"js.{name}(" not in timed]

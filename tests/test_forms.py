@@ -1,13 +1,17 @@
 """Operators in every form: at the prompt, in single precision, mapped, on curves, made by users."""
 
 import functools
+import re
 import tempfile
 from pathlib import Path
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
+import optimistix as optx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -540,6 +544,37 @@ def test_representations():
     assert repr(operator).startswith("Stencil(200 points, scalar to vector fields, 24 slots (")
     assert "Composition(200 points, scalar to scalar fields" in repr(js.biharmonic(CLOUD, **ARGS))
     jax.eval_shape(lambda c: repr(c) and c.points, CLOUD)  # traced ones have one too
+
+
+def test_what_came_of_it_is_said_in_a_line():
+    """Solutions have sizes, steps, residual and outcome in their repr, and nothing else changed."""
+    laplacian, z = js.laplace_beltrami(CLOUD, **ARGS), CLOUD.points[:, 2]
+    shifted = 1 - laplacian
+    found = js.solve(shifted, jnp.stack([z, z**2], axis=1))
+    assert isinstance(found, lx.Solution)
+    assert re.fullmatch(
+        r"LinearSolution\(200 points, 2 columns, float64; \d+( to \d+)? steps, "
+        r"relative residual \S+e-\d+; successful\)",
+        repr(found),
+    )
+    assert "1 of 2 failed" in repr(
+        js.solve(laplacian, jnp.stack([0 * z, 1 + z], axis=1), throw=False)
+    )
+    cubic = js.solve_nonlinear(laplacian - 1, lambda u, args: -(u**3), z, rhs=-z)
+    assert isinstance(cubic, optx.Solution)
+    assert re.fullmatch(r"NonlinearSolution\(200 .*; \d+ steps, .*; successful\)", repr(cubic))
+    heat = js.AdvectionDiffusionReaction(laplacian)
+    saves = dfx.SaveAt(ts=jnp.linspace(0, 0.1, 3))
+    run = js.integrate(heat, z, t1=0.1, saveat=saves)
+    assert isinstance(run, dfx.Solution) and run.ys.shape == (3, 200)
+    assert re.fullmatch(
+        r"TimeSolution\(float64 \(3, 200\) at t = 0 to 0.1 \(3 times\); "
+        r"\w+: \d+ steps \(\d+ refused\) to t = 0.1; successful\)",
+        repr(run),
+    )
+    short = js.integrate(heat, z, t1=0.1, max_steps=2, throw=False)
+    assert "of 0.1" in repr(short) and "maximum number" in repr(short)
+    eqx.filter_eval_shape(lambda s: repr(s) and s.ys, run)  # traced ones have one too
 
 
 # --- properties ------------------------------------------------------------------------------

@@ -297,14 +297,14 @@ POINTS_PLY = PLY.replace("element face 1\nproperty list uchar int vertex_indices
         ("a.vtk", "# vtk DataFile Version 3.0\nx\nASCII\n", "a.vtk: not readable"),
         ("a.vtu", "<VTKFile><Unstr", "a.vtu: not readable"),
         ("a.xyz", "0 0 0\n1 0\n", "a.xyz: "),
-        ("a.xyz", "0 0 0 1 1\n", "a.xyz: 5 columns; expected x y"),
+        ("a.xyz", "0 0 0 1 1\n", "a.xyz: 5 columns, .* expected x y or x y z"),
         ("a.xyz", "0 0 0\n1 0 inf\n", "a.xyz: point 1 is not finite"),
         (
             "a.xyz",
             "# x y z nx ny nz\n0 0 0 0 0 1\n1 0 0 0 0 0\n",
             r"a.xyz: normal 1 is \[0. 0. 0.\]",
         ),
-        ("a.xyz", "0 0 0 0 0 1\n1 0 0 0 0 1\n0 0 0 0 0 1\n", "a.xyz: points 0 and 2 coincide"),
+        ("a.xyz", "0 0 0\n1 0 0\n0 0 0\n", "a.xyz: points 0 and 2 coincide"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*input contained no data")
@@ -414,25 +414,32 @@ def write_columns(path, *columns, header=""):
 def test_a_value_in_the_fourth_column_is_not_taken_for_a_normal(tmp_path):
     x = np.asarray(ellipsoid(300).points)
     path = write_columns(tmp_path / "a.xyz", x, x[:, 2])
-    with pytest.raises(ValueError, match=r"row 0 has length .*columns='x y z value' or columns='x"):
+    with pytest.raises(ValueError, match=r"4 columns.*columns='x y z value' or columns='x y nx"):
         read(path)
     cloud = read(path, columns="x y z height", degree=2)
     assert cloud.dim == 3 and (np.asarray(cloud.points) == x).all()
     assert (read_fields(path, columns="x y z height")["height"] == x[:, 2]).all()
     named = write_columns(tmp_path / "b.xyz", x, x[:, 2], header="x y z height")
     assert read(named, degree=2).dim == 3 and set(read_fields(named)) == {"height"}
-    flat = read(write_columns(tmp_path / "c.xyz", curve(), curve()))
+    unit = write_columns(tmp_path / "c.xyz", curve(), curve())
+    with pytest.raises(ValueError, match="4 columns, which may be anything"):
+        read(unit)  # as `x y 0 1` would be
+    flat = read(unit, columns="x y nx ny")
     assert flat.dim == 2 and np.allclose(flat.normals, curve())
     long = write_columns(tmp_path / "d.xyz", curve(), 3 * curve())
     assert np.allclose(read(long, columns="x y nx ny").normals, curve())
 
 
-@pytest.mark.parametrize("most", [1.0, 255.0])
-def test_colours_are_not_taken_for_normals(tmp_path, most):
+@pytest.mark.parametrize("colours", ["shades", "red"])
+def test_colours_are_not_taken_for_normals(tmp_path, colours):
     cloud = ellipsoid(300)
-    colour = np.random.default_rng(0).integers(0, 256, (300, 3)) * (most / 255)
+    red = np.tile([1.0, 0.0, 0.0], (300, 1))  # of length one, as normals are
+    shades = np.random.default_rng(0).integers(0, 256, (300, 3))
+    colour = red if colours == "red" else shades
     path = write_columns(tmp_path / "a.xyz", cloud.points, colour)
-    with pytest.raises(ValueError, match=r"no unit normals: row \d.*columns='x y z r g b'"):
+    with pytest.raises(
+        ValueError, match=r"6 columns, .*columns='x y z nx ny nz' or columns='x y z r g b'"
+    ):
         read(path)
     back = read(path, columns="x y z r g b", degree=2)
     assert np.abs(np.asarray(back.normals) - cloud.normals).max() < 0.05

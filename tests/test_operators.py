@@ -9,6 +9,7 @@ import pytest
 import scipy.spatial.transform
 
 import jaxsurf as js
+from jaxsurf import operators
 
 from .helpers import KINDS, METHODS, exponential, jittered_sphere, label, relative_error
 
@@ -268,3 +269,61 @@ def test_single_precision(method):
     assert operator.weights.dtype == jnp.float32
     exact = js.laplace_beltrami(CLOUD, method=method)(U)
     assert relative_error(operator(U.astype(jnp.float32)), exact) < 2e-3
+
+
+@pytest.mark.parametrize(
+    "bad,text",
+    [
+        (-0.5, "diffusivity of point .* at least 0"),
+        (jnp.nan, "diffusivity of point .* at least 0"),
+        (np.diag([1.0, 1.0, -0.5]), "has the eigenvalue"),
+        (np.eye(3) + np.eye(3, k=1), "not symmetric"),
+    ],
+    ids=["negative", "NaN", "indefinite", "asymmetric"],
+)
+def test_traced_diffusivities_are_looked_at(bad, text):
+    cloud = jittered_sphere(200)
+    given = {"neighbors": js.find_neighbors(cloud, 15), "throw": False}
+    good = jnp.ones(200) if np.ndim(bad) == 0 else jnp.tile(jnp.eye(3), (200, 1, 1))
+    wrong = good.at[7].set(bad)
+    total = lambda d: jnp.sum(js.diffusion(cloud, d, **given)(cloud.points[:, 2]))
+    compiled = eqx.filter_jit(total)
+    assert jnp.isfinite(compiled(good))
+    with pytest.raises(eqx.EquinoxRuntimeError, match=text):
+        compiled(wrong)
+    # What is differentiated is known, and named; under `vmap` one bad one is enough.
+    with pytest.raises(ValueError, match=r"diffusivity.* point 7 "):
+        jax.grad(total)(wrong)
+    if np.ndim(bad) == 0:
+        with pytest.raises(eqx.EquinoxRuntimeError, match=text):
+            eqx.filter_jit(jax.vmap(total))(jnp.stack([good, wrong]))
+
+
+def made_in(jaxpr):
+    """Shapes and types of all that a program makes."""
+    for equation in jaxpr.eqns:
+        yield from ((v.aval.shape, v.aval.dtype) for v in equation.outvars)
+        for inner in jax.tree.leaves(
+            equation.params, is_leaf=lambda p: hasattr(p, "eqns") or hasattr(p, "jaxpr")
+        ):
+            if hasattr(inner, "eqns") or hasattr(inner, "jaxpr"):
+                yield from made_in(getattr(inner, "jaxpr", inner))
+
+
+def test_tensor_diffusion_is_small_and_stays_in_single_precision():
+    """Of its stencils of second derivatives it makes no copy, and no `(k, n, d, d)` array."""
+    cloud = jittered_sphere(200)
+    single = js.PointCloud(*(jnp.asarray(a, jnp.float32) for a in (cloud.points, cloud.normals)))
+    neighbors = js.find_neighbors(cloud, 15)
+    d = jnp.tile(jnp.diag(jnp.array([1.0, 2.0, 3.0])), (200, 1, 1))  # in double precision
+    make = lambda c, d: js.diffusion(c, d, neighbors=neighbors, throw=False).weights
+    found = list(made_in(jax.make_jaxpr(make)(single, d).jaxpr))
+    assert not [shape for shape, _ in found if shape in ((15, 200, 3, 3), (200, 15, 3, 3))]
+    wide = {shape for shape, dtype in found if dtype == jnp.float64}
+    assert not [shape for shape in wide if 15 in shape], wide  # nothing of a stencil's size
+    assert js.diffusion(single, d, neighbors=neighbors, throw=False).weights.dtype == jnp.float32
+    hessian = jnp.ones((15, 3, 3, 200), jnp.float32)
+    later = jax.make_jaxpr(operators._tensor_weights)(
+        d.astype(jnp.float32), single.normals, neighbors.indices.T, hessian
+    )
+    assert max(np.prod(shape) for shape, _ in made_in(later.jaxpr)) <= 15 * 200

@@ -7,8 +7,10 @@ made before, the cloud and its operator, say, is made before the clock starts.
 from __future__ import annotations
 
 import statistics
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -56,6 +58,44 @@ def stretched(cloud: js.PointCloud) -> js.PointCloud:
     return js.PointCloud(cloud.points * factors, normals, boundary=cloud.boundary)
 
 
+def _octahedron(levels: int) -> tuple[np.ndarray, np.ndarray]:
+    """A sphere of triangles, each cut into four at each level: 1,026 vertices at level 4."""
+    points = np.concatenate([np.eye(3), -np.eye(3)])
+    corners = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2)]
+    faces = np.array(corners + [(b, a, c + 3) for a, b, c in corners])
+    for _ in range(levels):
+        sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges, place = np.unique(sides, axis=0, return_inverse=True)
+        a, b, c = faces.T
+        ab, bc, ca = (len(points) + place.reshape(-1, 3)).T
+        faces = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
+        points = np.concatenate([points, points[edges].sum(axis=1)])
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return points, faces
+
+
+def _written(path: Path, *what) -> Path:
+    js.write(path, *what)
+    return path
+
+
+def _nothing(x, y):
+    return 0.0 * x
+
+
+def _peaks(s):
+    return 1 + 0.1 * jnp.sin(3 * s), s
+
+
+def _phi(x):
+    return jnp.sum(x**2) - 1
+
+
+def _closest(x):
+    x = x / jnp.linalg.norm(x, axis=1, keepdims=True)
+    return x, x
+
+
 def _egg(a):
     return lambda x: jnp.sum(x**4) + a * x[0] * x[1] - 1
 
@@ -89,6 +129,12 @@ class Made:
             ),
             # Once, with room for all that is searched.
             "capacity": lambda: js.allocate_search(js.sphere(N).points, 0.2),
+            "mesh": lambda: js.TriangleMesh(*_octahedron(4)),
+            "folder": lambda: Path(tempfile.mkdtemp()),
+            "file": lambda: _written(self.folder / "a.xyz", self.cloud),
+            "fields": lambda: _written(self.folder / "a.vtu", self.cloud, {"u": self.u}),
+            "flat": lambda: js.graph(_nothing, N).points[:, :2] * self.number,
+            "raw": lambda: np.asarray(self.cloud.points),
             "spin": lambda: jnp.cross(jnp.array([0.0, 0.0, 1.0]), self.cloud.points),
         }[name]()
         self.__dict__[name] = value
@@ -197,6 +243,101 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
         lambda m: js.hyperviscosity(m.laplacian, 1.0 * m.number)(m.u),
     ),
     "upwind_viscosity": ("closed", "spin", lambda m: js.upwind_viscosity(m.cloud, m.spin).weights),
+    "circle": ("closed", "", lambda m: js.circle(N, radius=m.number).points),
+    "double_torus": ("closed", "", lambda m: js.double_torus()[1]),
+    "surface_of_revolution": ("closed", "", lambda m: js.surface_of_revolution(_peaks, N).points),
+    "graph": ("closed", "", lambda m: js.graph(_saddle, N).points),
+    "project_to_level_set": (
+        "closed",
+        "",
+        lambda m: js.project_to_level_set(_phi, 1.1 * m.cloud.points),
+    ),
+    "level_set_normals": ("closed", "", lambda m: js.level_set_normals(_phi, m.cloud.points)),
+    "level_set_curvature": ("closed", "", lambda m: js.level_set_curvature(_phi, m.cloud.points)),
+    "sample_mesh": ("closed", "mesh", lambda m: js.sample_mesh(m.mesh, n=N, seed=int(m.number))),
+    "clean_mesh": ("closed", "mesh", lambda m: js.clean_mesh(*_octahedron(4))[0].vertices),
+    "sort_cloud": ("closed", "", lambda m: js.sort_cloud(m.cloud)[1]),
+    "jitter": ("closed", "", lambda m: js.jitter(m.cloud, _closest, spacing=0.07 * m.number)),
+    "poisson_disk": ("closed", "", lambda m: js.poisson_disk(m.cloud.points, 0.1 * m.number)),
+    "read": ("closed", "file", lambda m: js.read(m.file).points),
+    "read_fields": ("closed", "fields", lambda m: js.read_fields(m.fields)["u"]),
+    "write": ("closed", "folder", lambda m: js.write(m.folder / "b.vtu", m.cloud)),
+    "plot_cloud": ("closed", "folder", lambda m: js.plot_cloud(m.cloud, m.u) and None),
+    "plot_fields": ("closed", "folder", lambda m: js.plot_fields(m.cloud, {"u": m.u}) and None),
+    "from_points": ("closed", "raw", lambda m: js.from_points(m.raw)),
+    "tangent_frames": ("closed", "", lambda m: js.tangent_frames(m.cloud.normals)),
+    "tube_ratio": ("closed", "neighbors", lambda m: js.tube_ratio(m.cloud, m.neighbors)),
+    "allocate_search": (
+        "closed",
+        "",
+        lambda m: js.allocate_search(m.cloud.points, 0.2 * m.number).candidates,
+    ),
+    "discretize": ("closed", "", lambda m: js.discretize(m.cloud).laplacian.weights),
+    "biharmonic": ("closed", "", lambda m: js.biharmonic(m.cloud)(m.u)),
+    "partial_derivative": (
+        "closed",
+        "flat",
+        lambda m: js.partial_derivative(m.flat, (1, 0)).weights,
+    ),
+    "directional_derivative": (
+        "closed",
+        "spin",
+        lambda m: js.directional_derivative(m.cloud, m.spin).weights,
+    ),
+    "gauss_curvature": ("closed", "", lambda m: js.gauss_curvature(m.cloud)),
+    "mean_curvature_vector": ("closed", "", lambda m: js.mean_curvature_vector(m.cloud)),
+    "shape_tensor": ("closed", "", lambda m: js.shape_tensor(m.cloud)),
+    "identity": ("closed", "", lambda m: js.identity(N)(m.u)),
+    "jacobi": ("closed", "laplacian", lambda m: js.jacobi(m.laplacian - 1)(m.u)),
+    "detect_boundary": ("open", "", lambda m: js.detect_boundary(m.cloud)),
+    "find_border": ("open", "", lambda m: js.find_border(m.cloud).points),
+    "border_conormals": ("open", "", lambda m: js.border_conormals(m.cloud)),
+    "robin": ("open", "", lambda m: js.robin(m.cloud.boundary, m.number, a=1.0, b=1.0).where),
+    "dirichlet": ("open", "", lambda m: js.dirichlet(m.cloud.boundary, m.number).where),
+    "free": ("open", "", lambda m: js.free(m.cloud.boundary).where),
+    "choose_solver": ("closed", "problem", lambda m: js.choose_solver(m.problem) and None),
+    "step_preconditioner": (
+        "closed",
+        "problem",
+        lambda m: js.step_preconditioner(m.problem, m.u)(0.1 * m.number).mv(m.u),
+    ),
+    "steady_state": (
+        "closed",
+        "problem",
+        lambda m: js.integrate(
+            m.problem, 1 + m.cloud.points[:, 2], t1=1e3, event=js.steady_state(rtol=1e-3 * m.number)
+        ).ys,
+    ),
+    "integrate, SDIRK": (
+        "closed",
+        "problem",
+        lambda m: js.integrate(
+            m.problem, m.u, t1=0.05 * m.number, solver=js.SDIRK(order=3), dt0=0.01
+        ).ys,
+    ),
+    "integrate, waves": (
+        "closed",
+        "laplacian",
+        lambda m: js.integrate(
+            js.WaveEquation(m.laplacian, speed=m.number), (m.u, 0 * m.u), t1=0.05
+        ).ys,
+    ),
+    "integrate, Cahn-Hilliard": (
+        "closed",
+        "laplacian",
+        lambda m: js.integrate(
+            js.CahnHilliard(m.laplacian, width=0.3 * m.number), 0.1 * m.u, t1=1e-3, dt0=5e-4,
+            solver=js.IMEX(order=3),
+        ).ys,
+    ),
+    "integrate, biharmonic": (
+        "closed",
+        "laplacian",
+        lambda m: js.integrate(
+            js.BiharmonicDiffusion(m.laplacian, stiffness=m.number), m.u, t1=1e-3, dt0=5e-4,
+            solver=js.SDIRK(order=3),
+        ).ys,
+    ),
 }  # fmt: skip
 
 

@@ -37,7 +37,8 @@ def border_conormals(cloud: PointCloud, border: Border | None = None) -> Float[A
     Returns:
         Unit vectors `(m, d)`, in the order of the indices of the m marked points.
 
-    Accuracy: angle O(h⁴) on smooth borders (`tests/test_boundary.py`).
+    Accuracy: angle O(h⁴) on smooth borders (`tests/test_boundary.py`). In float32 within 1e-5
+    (`tests/test_boundary.py`).
     Differentiable: forward and reverse, in points and normals, for a given border.
     Raises:
         ValueError: as `find_border`.

@@ -7,15 +7,8 @@ import re
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray as Array
 
-from jaxsurf.failures import raise_at
 from jaxsurf.formats.contents import Contents, complete
-
-# Rows of three columns in text files are normals if they are this close to length one: what two
-# decimals leave.
-_UNIT = 0.01
 
 
 def obj(path: Path) -> Contents:
@@ -134,7 +127,7 @@ def xyz(path: Path, columns: str | None = None) -> Contents:
         title = first[1:].split() if first.startswith("#") else []
         if len(title) == count and title[:2] == ["x", "y"]:
             columns = " ".join(title)
-    names = _guessed(rows) if columns is None else columns.split()
+    names = _named(count) if columns is None else columns.split()
     if len(names) != count:
         raise ValueError(f"columns names {len(names)} ({' '.join(names)}), there are {count}")
     if len(set(names)) < len(names):
@@ -151,27 +144,16 @@ def xyz(path: Path, columns: str | None = None) -> Contents:
     return Contents(points, normals=normals, fields=column)
 
 
-def _guessed(rows: Float[Array, "n c"]) -> list[str]:
-    """What the columns are, where their number and the length of the normals leave no doubt."""
-    known = {2: "x y", 3: "x y z", 4: "x y nx ny", 6: "x y z nx ny nz"}
-    count = rows.shape[1]
-    if count not in known:
-        raise ValueError(
-            f"{count} columns; expected x y [nx ny] in the plane or x y z [nx ny nz] in space. "
-            "Name others, as in columns='x y z value'"
-        )
-    if count > 3:
-        last = rows[:, count // 2 :]
-        length = np.linalg.norm(last, axis=1)
-        other = "x y z value" if count == 4 else "x y z r g b"
-        raise_at(
-            ~(np.abs(length - 1) <= _UNIT),
-            f"{count} columns, of which the last {count // 2} are no unit normals: row {{i}} has "
-            f"length {{v:.4g}}, expected 1. Say what they are with columns='{other}' or "
-            f"columns='{known[count]}' (directions of any length)",
-            length,
-        )
-    return known[count].split()
+def _named(count: int) -> list[str]:
+    """What as many columns are that nothing names: coordinates alone leave no doubt."""
+    if count in (2, 3):
+        return ["x", "y", "z"][:count]
+    some = {4: ("x y z value", "x y nx ny"), 6: ("x y z nx ny nz", "x y z r g b")}
+    ways = " or ".join(f"columns='{names}'" for names in some.get(count, ("x y z value",)))
+    raise ValueError(
+        f"{count} columns, which may be anything; expected x y or x y z. Name them with {ways}, or "
+        "so in a first line (# x y z ...)"
+    )
 
 
 def _lines(path: Path):

@@ -48,6 +48,7 @@ def project_to_level_set(
     Returns:
         Points on the level set, `(n, d)`, to round-off.
 
+    Accuracy: in float32 within 3e-6 of a torus of radii 3 and 1 (`tests/test_shapes.py`).
     Differentiable: forward and reverse and to any order, in `points` and in everything that
         `phi` depends on, by the implicit function theorem: the iteration is not unrolled. A point
         that starts on the surface moves by −∂phi ∇phi/|∇phi|² per unit of a parameter.
@@ -113,6 +114,7 @@ def level_set_normals(phi: LevelSet, points: Float[Array, "n d"]) -> Float[Array
     Returns:
         `(n, d)`, outward where phi grows outwards.
 
+    Accuracy: in float32 within 1e-5 on a unit sphere (`tests/test_shapes.py`).
     Differentiable: forward and reverse, in the points and in what `phi` depends on.
     Raises:
         ValueError: the gradient vanishes or is not finite, named by point, on concrete arrays.
@@ -144,6 +146,7 @@ def level_set_curvature(
     Returns:
         Mean curvature in 1/length and Gauss curvature in 1/length², `(n,)` each.
 
+    Accuracy: in float32 within 1e-4 on a unit sphere (`tests/test_shapes.py`).
     Differentiable: forward and reverse, in the points and in what `phi` depends on.
     Raises:
         ValueError: the gradient vanishes or is not finite, named by point, on concrete arrays.

@@ -17,7 +17,7 @@ from ..build import choose_neighbors
 from ..cloud import PointCloud
 from ..compiling import at_once, sized_jit
 from ..discretization import Discretization
-from ..failures import is_concrete, needs_values, refuse
+from ..failures import is_concrete, needs_values, refuse, unchecked
 from ..neighbors import Neighbors, find_neighbors, switched_on
 from ..stencils.gfdm import GFDM
 from ..stencils.method import AbstractMethod
@@ -136,18 +136,18 @@ def _distances(place, neighbors, plain, path, known, inverse, smoothing, rtol):
     laplacian = jnp.where(mixed, _random_walk(points, indices, share), laplacian)
     # The operators on v: similar to those on u, whatever the path.
     growth = jnp.exp((path - path[indices]) / spacing)
-    heat = Stencil(indices, (-(spacing**2) * laplacian * growth).at[0].add(1))
+    heat = unchecked(Stencil, indices, (-(spacing**2) * laplacian * growth).at[0].add(1))
     # Switched-off points have equations of their own, v = 1 and then d = 0.
     start = off.astype(path.dtype).at[sources].set(1)
     v = _warm(heat, start, rtol)
-    flow = Stencil(indices, -gradient * growth[:, None], (points.shape[1],))(v)
+    flow = unchecked(Stencil, indices, -gradient * growth[:, None], (points.shape[1],))(v)
 
     distance, away = _arcs(points, normals, near, owners)
     # Only directions count; those next to the sources are known.
     direction = _unit(flow)
     others = share * ~mixed[indices]
     replaced = mixed & (jnp.sum(others, axis=0) > 0)
-    from_others = _unit(Stencil(indices, others)(direction))
+    from_others = _unit(unchecked(Stencil, indices, others)(direction))
     direction = jnp.where(replaced[:, None], from_others, direction).at[near].set(away)
     value = jnp.zeros_like(path).at[near].set(distance)
     return _integrate(place, (indices, share, fixed), direction, value, inverse, rtol)
@@ -170,7 +170,7 @@ def _warm(heat: Stencil, start, rtol: float):
     values = _relaxed(known, given, known.diagonal, jnp.abs, rtol)
     weights = heat.weights * (values[heat.indices] / values)
     # Zero; what is left of it is the derivative of the equation at its solution.
-    residual = start / values - Stencil(heat.indices, weights)(jnp.ones_like(values))
+    residual = start / values - unchecked(Stencil, heat.indices, weights)(jnp.ones_like(values))
     residual = residual - jax.lax.stop_gradient(residual)
     return values * (1 + _zero(weights, residual, heat.indices, rtol))
 
@@ -186,7 +186,7 @@ def _zero(weights, residual, indices, rtol: float):
 def _zero_jvp(rtol, primals, tangents):
     weights, residual, indices = primals
     d_weights, d_residual, _ = tangents
-    operator = Stencil(indices, weights)
+    operator = unchecked(Stencil, indices, weights)
     diagonal = jax.lax.stop_gradient(operator.diagonal)
     nothing = _zero(weights, residual, indices, rtol)
 
@@ -194,7 +194,7 @@ def _zero_jvp(rtol, primals, tangents):
         largest = lambda x: jnp.max(jnp.abs(x))
         return _relaxed(matvec, b, diagonal, largest, rtol)
 
-    d_residual = d_residual - Stencil(indices, d_weights)(nothing)
+    d_residual = d_residual - unchecked(Stencil, indices, d_weights)(nothing)
     return nothing, jax.lax.custom_linear_solve(operator, d_residual, solve, solve)
 
 
@@ -239,7 +239,7 @@ def _shares(mask) -> Float[np.ndarray, "k n"]:
 def _differences(indices, share, fixed, table=None) -> Stencil:
     """Value less the mean of the others, between free points; the identity where it is known."""
     own = np.arange(len(share))[:, None] == 0
-    return Stencil(indices, own - share * ~(fixed | fixed[indices]), table=table)
+    return unchecked(Stencil, indices, own - share * ~(fixed | fixed[indices]), table=table)
 
 
 def _preconditioner(indices, share, fixed, differentiated: bool):

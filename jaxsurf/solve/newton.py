@@ -18,6 +18,7 @@ from ..boundary import Closure
 from ..compiling import sized_jit
 from ..failures import is_concrete, refuse
 from ..functions import canonical, constant, numbers_as_arrays
+from ..solutions import told
 from ..stencils.algebra import AbstractOperator, Map
 from ..stencils.stencil import prepared
 from .krylov import BiCGStab, solve_system, tolerances_as_arrays
@@ -138,7 +139,7 @@ def solve_nonlinear(
             f"tolerance below the round-off of {u0.dtype}{more_digits(u0.dtype)}; throw=False "
             "returns what was reached"
         )
-    return solution
+    return told(solution)
 
 
 class _Problem(eqx.Module):

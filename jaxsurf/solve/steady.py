@@ -12,6 +12,7 @@ from ..arguments import as_float, count_on, finite, more_digits, switched_off, w
 from ..boundary import Closure
 from ..compiling import at_once, sized_jit
 from ..failures import is_concrete, needs_values, refuse, without_derivatives
+from ..solutions import told
 from ..stencils.algebra import AbstractOperator
 from ..stencils.stencil import prepared
 from .krylov import BiCGStab, scale_of, solve_system, tolerances_as_arrays
@@ -124,7 +125,7 @@ def solve(
     solution = _solve(rhs, *problem, bool(mean_zero), throw and not concrete)
     if throw and concrete:
         _raise_on_failure(solution, rhs.dtype, rtol, atol)
-    return solution
+    return told(solution)
 
 
 @sized_jit

@@ -16,7 +16,7 @@ import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
 from ..arguments import is_array, mask, point_indices, shaped, switched_off
-from ..failures import check, is_concrete
+from ..failures import check, is_concrete, unchecked
 from .algebra import AbstractOperator, Transposed, per_point
 from .gathers import product
 from .masks import both, either
@@ -48,7 +48,8 @@ class Stencil(AbstractOperator):
     Differentiable: forward and reverse, in the weights and in the field.
     Raises:
         TypeError: indices that are not integers, weights that are not real floating-point numbers.
-        ValueError: shapes that do not fit; on concrete arrays an index that is no point.
+        ValueError: shapes that do not fit; an index that is no point (in compiled code too, when it
+            runs).
 
     Example:
         >>> laplacian = js.laplace_beltrami(js.sphere(300))
@@ -68,7 +69,8 @@ class Stencil(AbstractOperator):
     def __check_init__(self):
         if not is_array(self.indices):
             return  # a pytree of something else, as transformations make them
-        point_indices(self.indices, "indices", axes="(k, n)", n=-1)
+        indices = point_indices(self.indices, "indices", axes="(k, n)", n=-1)
+        object.__setattr__(self, "indices", indices)  # with the errors of compiled code
         weights = self.weights
         if is_array(weights):
             if not jnp.issubdtype(weights.dtype, jnp.floating):
@@ -148,7 +150,8 @@ class Stencil(AbstractOperator):
         if isinstance(other, Stencil) and self._has_slots_of(other):
             marks = either(self.border, other.border), both(self.active, other.active)
             weights, shapes = self.weights + other.weights, (self.out_shape, self.in_shape)
-            return Stencil(self.indices, weights, *shapes, None, *marks, self.table)
+            fields = (self.indices, weights, *shapes, None, *marks, self.table)
+            return unchecked(Stencil, *fields)
         if isinstance(other, AbstractOperator) or self.in_shape or not self._starts_with_centers:
             return super().__add__(other)
         return self._with(self.weights.at[0].add(self._own(other, "term")))
@@ -161,7 +164,7 @@ class Stencil(AbstractOperator):
     def of_weights(self, weights, out_shape=(), in_shape=()) -> Stencil:
         """Another operator on the same slots, whose weights were computed from these."""
         known = (self.diagnostics, self.border, self.active)
-        return Stencil(self.indices, weights, out_shape, in_shape, *known)
+        return unchecked(Stencil, self.indices, weights, out_shape, in_shape, *known)
 
     def _with(self, weights) -> Stencil:
         return eqx.tree_at(lambda s: s.weights, self, weights)

@@ -61,7 +61,8 @@ class RKC2(dfx.AbstractAdaptiveSolver):
             `diffrax.DirectAdjoint`). `js.integrate` sets it.
 
     Accuracy: second order; the embedded estimate of the local error is of third order
-    (`tests/test_time_explicit.py`).
+    (`tests/test_time_explicit.py`). In float32 values are within 1e-3 and derivatives within 1e-2
+    at the default tolerances (`tests/test_time_pde.py`).
     Differentiable: forward and reverse, in the state and everything the right-hand side
     depends on. The number of stages and ρ are not differentiated.
     Raises:

@@ -125,6 +125,8 @@ def step_preconditioner(
     Returns:
         A function of g, for traced g too; a constant for derivatives.
 
+    Accuracy: in float32 the inverse is within 1e-4 of that in double precision
+    (`tests/test_time_forms.py`).
     Raises:
         ImportError: pyamg is not installed (extra `multigrid`).
         ValueError: another problem, no diffusion, traced arrays.

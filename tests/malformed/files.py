@@ -122,8 +122,8 @@ READ = [
     Case(
         "read",
         "colours in columns four to six",
-        lambda: js.read(xyz("e.xyz", SPACE, np.full((20, 3), 0.5))),
-        ("e.xyz", "row 0 has length 0.866", "columns='x y z r g b'"),
+        lambda: js.read(xyz("e.xyz", SPACE, np.tile([1.0, 0.0, 0.0], (20, 1)))),
+        ("e.xyz", "6 columns", "columns='x y z r g b'"),
     ),
     Case(
         "read",

@@ -181,6 +181,8 @@ def search_neighbors(
     """
     points = _checked_points(points, active)
     instance(capacity, SearchCapacity, "capacity", "see allocate_search")
+    for name, size in capacity._asdict().items():
+        whole(size, f"capacity.{name}", least=1)
     if normals is not None:
         normals = as_float(normals, "normals")
         if normals.shape != points.shape:

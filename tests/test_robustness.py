@@ -89,6 +89,9 @@ def tensor(cloud):
     return jnp.broadcast_to(a, (N, 3, 3)) * (2 + cloud.points[:, 0])[:, None, None]
 
 
+ALONG = jnp.array([0.0, 0.0, 1.0])
+
+
 def heat(p, **solver):
     equation = js.AdvectionDiffusionReaction(p.laplacian, diffusivity=0.1)
     return js.integrate(equation, smooth(p.cloud.points), t1=0.1, **solver).ys[-1]
@@ -159,6 +162,38 @@ POINTWISE = {
     ),
     "geodesic_distance": (
         lambda p: js.geodesic_distance(p.cloud, jnp.argmax(p.u)[None], **p.given),
+        [EVEN],
+        1e-10,
+    ),
+    "areas": (
+        lambda p: js.discretize(p.cloud, p.given["neighbors"], method=p.method).areas,
+        [EVEN],
+        1e-11,
+    ),
+    "conservative_weights": (lambda p: js.conservative_weights(p.laplacian, 1.0), [EVEN], 1e-9),
+    "upwind_viscosity": (
+        lambda p: js.upwind_viscosity(p.cloud, jnp.cross(p.cloud.points, ALONG), **p.given)(p.u),
+        UNEVEN[:1],
+        1e-11,
+    ),
+    "solve_nonlinear": (
+        lambda p: (
+            js.solve_nonlinear(
+                p.laplacian - 1, lambda u, args: -(u**3), 0 * p.u, rhs=-p.u, rtol=1e-11
+            ).value
+        ),
+        [EVEN],
+        1e-9,
+    ),
+    "RBFFD": (
+        lambda p: js.laplace_beltrami(p.cloud, p.given["neighbors"], method=js.RBFFD(degree=2))(
+            p.u
+        ),
+        UNEVEN[:1],
+        1e-10,
+    ),
+    "GFDM(degree=4)": (
+        lambda p: js.laplace_beltrami(p.cloud, method=js.GFDM(degree=4))(p.u),
         [EVEN],
         1e-10,
     ),

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from .arguments import as_float, finite, instance, mask, real, whole
-from .failures import is_concrete, unchecked
+from .failures import is_concrete, refuse, unchecked
 from .neighbors import Neighbors
 from .sheets import cosine_slack
 
@@ -194,19 +194,18 @@ def search_neighbors(
     real(radius, "radius", above=0)
     real(min_cosine, "min_cosine", least=-1, most=1)
     # Numbers go in as arrays: another value compiles nothing.
-    numbers = (jnp.asarray(value, points.dtype) for value in (radius, min_cosine))
-    slots, batch_size = capacity.k if k is None else k, whole(batch_size, "batch_size", least=1)
-    return _search(points, *numbers, normals, active, capacity, k, slots, throw, batch_size)
+    bounds = tuple(jnp.asarray(value, points.dtype) for value in (radius, min_cosine))
+    batch_size = min(whole(batch_size, "batch_size", least=1), len(points))
+    return _search((points, normals), active, bounds, capacity, k, throw, batch_size)
 
 
-@functools.partial(jax.jit, static_argnums=(5, 6, 7, 8, 9))
+@functools.partial(jax.jit, static_argnums=(3, 4, 5, 6))
 def _search(
-    points, radius, min_cosine, normals, active, capacity, k, slots, throw, batch_size
+    where, active, bounds, capacity: SearchCapacity, k: int | None, throw: bool, batch_size: int
 ) -> tuple[Neighbors, SearchReport]:
-    n = len(points)
-    points = jax.lax.stop_gradient(points)
-    normals = None if normals is None else jax.lax.stop_gradient(normals)
-    radius = jax.lax.stop_gradient(radius)
+    """Within bounds (a radius and a least cosine), where points are and how they face, if known."""
+    (points, normals), (radius, min_cosine) = jax.lax.stop_gradient((where, bounds))
+    n, slots = len(points), capacity.k if k is None else k
     on = all_on(points, active)
     start, length, order = _candidates(points, radius, on)
     limit = distance_key(radius * radius)
@@ -234,9 +233,7 @@ def _search(
         return _pad(j, slots, i), _pad(mask, slots, False), good.sum()
 
     rows = (jnp.arange(n, dtype=jnp.int32), start, length)
-    indices, mask, count = jax.lax.map(
-        lambda a: row(*a), rows, batch_size=min(batch_size, max(n, 1))
-    )
+    indices, mask, count = jax.lax.map(lambda a: row(*a), rows, batch_size=batch_size)
     needed = length.sum(axis=1)
     full = jnp.asarray(slots, count.dtype)
     report = SearchReport(
@@ -249,7 +246,7 @@ def _search(
     )
     neighbors = unchecked(Neighbors, indices, mask, radius if k is None else None)
     if throw:
-        neighbors = eqx.error_if(
+        neighbors = refuse(
             neighbors,
             report.overflow,
             f"neighbour search: {slots} slots and {capacity.candidates} candidates per point are "

@@ -88,8 +88,8 @@ def cell_weights(
     # Programs of their own: in one, the compiler finds much again for every use of it, and a
     # derivative took fifteen times as long as the value.
     planes, graphs = _surfaces(blocks, degree)
-    ways, closed = _ways_of_blocks(planes, graphs, mask, lines, cells)
-    moments = _moments_of_blocks(planes, graphs, mask, lines, ways, cells)
+    ways = _ways_of_blocks(*jax.lax.stop_gradient((planes, mask, lines)), cells)
+    moments, closed = _moments_of_blocks(planes, graphs, mask, lines, ways, cells)
     weights, residual = _weights_of_blocks(planes, mask, moments, degree)
     weights, (closed, residual) = rows_of(weights, (closed, residual), cloud.n)
     on = neighbors.mask[:, 0]
@@ -108,20 +108,21 @@ def _surfaces(blocks, degree: int):
 
 
 @sized_jit
-def _ways_of_blocks(planes, graphs, mask, lines, cells: int):
+def _ways_of_blocks(planes, mask, lines, cells: int):
     def ways(block):
-        plane, graph, mask, line = block
+        plane, mask, line = block
         sides = Sides.of(plane, mask, cells, line)
-        return _ways_of_curve(sides) if graph.dim == 1 else _ways(sides, graph)
+        return _ways_of_curve(sides) if len(sides.flat) == 1 else _ways(sides)
 
-    return blockwise(ways, (planes, graphs, mask, lines))
+    return blockwise(ways, (planes, mask, lines))
 
 
 @sized_jit
 def _moments_of_blocks(planes, graphs, mask, lines, ways, cells: int):
     def moments(block):
-        plane, graph, mask, line, ways = block
-        return _moments(Sides.of(plane, mask, cells, line), graph, *ways)
+        plane, graph, mask, line, (ways, room) = block
+        found, reach = _moments(Sides.of(plane, mask, cells, line), graph, ways)
+        return found, 4 * reach <= room
 
     return blockwise(moments, (planes, graphs, mask, lines, ways))
 
@@ -226,9 +227,52 @@ class Sides(eqx.Module):
         return beyond, self.flat + slope * self.high
 
 
-def _moments(sides: Sides, graph: Graph, ends, measure, which):
-    r"""$\int q^\gamma\,dA$ over a cell for all monomials up to the degree."""
-    degree, nodes, sides = graph.degree, _nodes(graph), sides.chosen(which)
+def _moments(sides: Sides, graph: Graph, ways):
+    r"""$\int q^\gamma\,dA$ over a cell for all monomials up to the degree, and how far it reaches.
+
+    The latter squared.
+    """
+    if graph.dim == 1:
+        return _along_ways(sides.chosen(ways[2]), graph, *ways[:2]), jnp.zeros_like(ways[1][0])
+    side, still = ways
+    of_first = lambda count: _over_sides(sides.chosen(side[:count]), still[:count], graph)
+    few = len(side) // 2
+    # Few cells have more sides, and most blocks have none of these.
+    return jax.lax.cond(jnp.all(still[few - 1]), lambda: of_first(few), lambda: of_first(len(side)))
+
+
+def _over_sides(these: Sides, still, graph: Graph):
+    """The moments of a cell: of the triangles between its point and each side.
+
+    Args:
+        these: sides in turn; the last stands for all that follow.
+        still: whether a side is the last, which the first one cuts off.
+    """
+    those = jax.tree.map(lambda a: jnp.where(still, a[..., :1, :], jnp.roll(a, -1, axis=-2)), these)
+
+    def newton(q, these, those, graph):
+        (u, a), (v, b) = these.miss(graph, q), those.miss(graph, q)
+        return q - _meeting(u, v, *jax.lax.stop_gradient((a, b)))
+
+    straight = _meeting(these.offset, those.offset, these.flat, those.flat)
+    last = _root(newton, jax.lax.stop_gradient(straight), these, those, graph)
+    first = jnp.roll(last, 1, axis=1)
+    turn = first[0] * last[1] - first[1] * last[0]
+    share, weights = _gauss(_nodes(graph), 0)
+    ends = jnp.concatenate([first + x * (last - first) for x in share], axis=1)
+    again = jax.tree.map(lambda a: jnp.concatenate([a] * len(share), axis=-2), these)
+    found = _along_ways(again, graph, ends, jnp.concatenate([w * turn for w in weights]))
+    return found, jnp.max(jnp.sum(jax.lax.stop_gradient(last) ** 2, axis=0), axis=0)
+
+
+def _along_ways(sides: Sides, graph: Graph, ends, measure):
+    """The moments from those of ways that end at sides.
+
+    Args:
+        ends: of the ways if the sides were straight.
+        measure: what each stands for then.
+    """
+    degree, nodes = graph.degree, _nodes(graph)
 
     def newton(length, sides, graph, ends):
         beyond, slope = sides.miss(graph, length * ends)
@@ -257,33 +301,17 @@ def _nodes(graph: Graph) -> int:
     return graph.degree // 2 + 1
 
 
-def _ways(sides: Sides, graph: Graph):
-    """Some ways from the point to each side of its cell.
+def _ways(sides: Sides):
+    """The sides of a cell in turn.
 
     Returns:
-        Their ends if the sides were straight, what each stands for, and the numbers of the sides;
-        and whether the cell is closed.
+        Their numbers, and whether each is the last; and the square of twice as far as the cell may
+        reach: no point beyond the neighbours looked at can then have a part of it. Negative where
+        it is not closed.
     """
-    fixed = jax.lax.stop_gradient(sides)
-    side, following, closed = _round(fixed.flat, fixed.offset, fixed.on)
-    these, those = sides.chosen(side), sides.chosen(following)
-
-    def newton(q, these, those, graph):
-        (u, a), (v, b) = these.miss(graph, q), those.miss(graph, q)
-        return q - _meeting(u, v, *jax.lax.stop_gradient((a, b)))
-
-    straight = _meeting(these.offset, those.offset, these.flat, those.flat)
-    last = _root(newton, jax.lax.stop_gradient(straight), these, those, graph)
-    first = jnp.roll(last, 1, axis=1)
-    turn = first[0] * last[1] - first[1] * last[0]
-    # No point beyond the neighbours looked at can have a part of what is nearer to this one.
-    reach = jnp.max(jnp.sum(last**2, axis=0), axis=0)
-    away = jnp.where(fixed.on & (fixed.offset > 0), jnp.sum(fixed.flat**2, axis=0), 0)
-    closed = closed & (4 * reach <= jnp.max(away, axis=0))
-    share, weights = _gauss(_nodes(graph), 0)
-    ends = jnp.concatenate([first + x * (last - first) for x in share], axis=1)
-    which = jnp.concatenate([side] * len(share))
-    return (ends, jnp.concatenate([w * turn for w in weights]), which), closed
+    side, following, closed = _round(sides.flat, sides.offset, sides.on)
+    away = jnp.where(sides.on & (sides.offset > 0), jnp.sum(sides.flat**2, axis=0), 0)
+    return (side, following == side[0]), jnp.where(closed, jnp.max(away, axis=0), -1)
 
 
 def _meeting(u, v, a, b):
@@ -329,9 +357,9 @@ def _round(flat, offset, on):
 
 
 def _ways_of_curve(sides: Sides):
-    """The same for a curve, with one way to either side, and the numbers of these."""
+    """The ways to either side of a curve's cell, and the numbers of these; room as above."""
     # The product of an end and the way to it does not depend on the end.
-    flat, offset, on = jax.lax.stop_gradient((sides.flat[0], sides.offset, sides.on))
+    flat, offset, on = sides.flat[0], sides.offset, sides.on
     at = offset / jnp.where(flat == 0, 1, flat)
     after = jnp.where(on & (flat > 0), at, jnp.inf)
     before = jnp.where(on & (flat < 0), at, -jnp.inf)
@@ -339,7 +367,7 @@ def _ways_of_curve(sides: Sides):
     which = jnp.stack([jnp.argmax(before, axis=0), jnp.argmin(after, axis=0)])
     closed = jnp.all(jnp.isfinite(ends), axis=0)
     ends = jnp.where(jnp.isfinite(ends), ends, 0)
-    return (ends[None], jnp.abs(ends), which), closed
+    return (ends[None], jnp.abs(ends), which), jnp.where(closed, 0, -1)
 
 
 def _root(newton: Callable, start, *known):

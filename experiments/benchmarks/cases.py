@@ -199,7 +199,7 @@ def moved(name: str, n: int) -> dict:
 
     Gradients in the points, of areas outside `jit`, where they are several programs, and in it.
     With the neighbours kept, and found anew: these alone, with all decisions (which need the
-    Laplacian) and the normals, and with the areas.
+    Laplacian) and the normals, and with the areas; and the gradient through all of it.
     """
     method, _ = METHODS[name]
     surface = js.discretize(js.sphere(n), method=method)
@@ -210,6 +210,12 @@ def moved(name: str, n: int) -> dict:
     volume = lambda x: jnp.vdot(fresh(x).areas, jnp.sin(x[:, 2]))
 
     everything_of = lambda there: (there.laplacian.weights, there.areas, there.code)
+
+    def total(x):
+        """Of all that a motion changes: operators, normals and areas."""
+        there = surface.moved(x, search=search)
+        weights, areas, _ = everything_of(there)
+        return jnp.vdot(areas, jnp.sin(x[:, 2])) + jnp.mean(weights**2) + there.cloud.normals.std()
 
     search = surface.search()
     lists = surface.neighbors
@@ -228,6 +234,7 @@ def moved(name: str, n: int) -> dict:
         "gradient of areas": jax.grad(volume),
         "gradient of areas in jit": jax.jit(jax.grad(volume)),
         "moved": jax.jit(lambda x: everything_of(surface.moved(x))),
+        "gradient of all, neighbours anew": jax.jit(jax.grad(total)),
     }
     found: dict = {}
     for label, call in calls.items():
@@ -235,6 +242,8 @@ def moved(name: str, n: int) -> dict:
         found |= {f"{label} s": seconds, f"{label}, first s": first}
         if label != "Laplacian":
             found[f"{label} / Laplacian"] = seconds / found["Laplacian s"]
+    forward = found["the same and areas s"]
+    found["reverse / forward"] = found["gradient of all, neighbours anew s"] / forward
     return found
 
 

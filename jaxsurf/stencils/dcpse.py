@@ -81,8 +81,12 @@ class DCPSE(AbstractMethod):
         count = _layers(self.order) if self.layers is None else self.layers
         step = radius / (count + 0.5) if self.layer_spacing is None else self.layer_spacing
 
-        # Along the axes of the tangent frame, in which the lines of copies are steep.
-        frame = jnp.moveaxis(frames_of(neighborhood.normals[0].T), (-2, -1), (0, 1))
+        # Along the axes of the tangent frame, in which the lines of copies are steep. Any rotated
+        # axes give the same weights: these have no derivative.
+        normal = jax.lax.stop_gradient(neighborhood.normals[0])
+        length = jnp.sqrt(jnp.sum(normal**2, axis=0))
+        normal = normal / jnp.where(length > 0, length, 1)
+        frame = jnp.moveaxis(frames_of(normal.T), (-2, -1), (0, 1))
         offsets, normals = (
             jnp.stack([dot(a, axis[None]) for axis in frame])
             for a in (neighborhood.offsets, neighborhood.normals)

@@ -80,7 +80,7 @@ def _system(x, w, low, high):
     start = len(multi_indices(len(x), 0, low - 1))
     small = _is_small(x, low, high)
     v: list[Array] | Array = monomial_rows(x, high) if small else monomials(x, high)
-    gram = _gram(x, w, low, high)
+    gram = gram_matrix(x, w, low, high)
     return v, start, gram, systems.factor(gram)
 
 
@@ -99,8 +99,8 @@ def _moment_solve_jvp(low, high, primals, tangents):
     x, w, b = primals
     dx, dw, db = tangents
     (eta, condition, residual), (v, start, solve, a, s) = _solve(x, w, b, low, high)
-    g = dw * s + w * _moved(a, v, dx, start, high)
-    rhs = _add_moved_moments(systems.moments(v[start:], g), eta, v, dx, start, high)
+    g = dw * s + w * moved(a, v, dx, start, high)
+    rhs = add_moved_moments(systems.moments(v[start:], g), eta, v, dx, start, high)
     if b.ndim > 2:
         rhs = systems.add(rhs, [-row for row in db] if isinstance(rhs, list) else -db)
     d_eta = g - w * systems.combine(solve(rhs), v[start:])
@@ -154,19 +154,19 @@ def _polynomial_fit_jvp(low, high, primals, tangents):
     (out, condition), (v, start, solve) = _fit(x, w, values, low, high)
     a = list(out) if isinstance(v, list) else out
     left = values - systems.combine(a, v[start:])
-    g = dw * left + w * (dz - _moved(a, v, dx, start, high))
-    da = solve(_add_moved_moments(systems.moments(v[start:], g), w * left, v, dx, start, high))
+    g = dw * left + w * (dz - moved(a, v, dx, start, high))
+    da = solve(add_moved_moments(systems.moments(v[start:], g), w * left, v, dx, start, high))
     da = jnp.stack(da) if isinstance(v, list) else da
     return (out, condition), (da, jnp.zeros_like(condition))
 
 
-def _moved(a, v, dx, start, high):
+def moved(a, v, dx, start, high):
     """dV a: the gradient of the polynomials with coefficients a, along dx."""
     matrices = differentiation(len(dx), high)[:, :, start:]
     return sum(systems.combine(systems.transform(d, a), v) * dx_i for d, dx_i in zip(matrices, dx))
 
 
-def _add_moved_moments(rhs, eta, v, dx, start, high):
+def add_moved_moments(rhs, eta, v, dx, start, high):
     """A right-hand side plus dV^T eta: the same matrices transposed."""
     for d, dx_i in zip(differentiation(len(dx), high)[:, :, start:], dx):
         rhs = systems.add(rhs, systems.transform(d.T, systems.moments(v, eta * dx_i)))
@@ -187,7 +187,8 @@ def _gather_table(dim: int, low: int, high: int) -> tuple[np.ndarray, np.ndarray
     return rows.astype(np.int32), total[..., -1].astype(np.int32)
 
 
-def _gram(x, w, low, high):
+def gram_matrix(x, w, low, high):
+    """The matrix A, each moment summed once; in small systems as lists of rows."""
     basis = multi_indices(len(x), low, high)
     if _is_small(x, low, high):
         place = position(len(x), 2 * high)
@@ -198,7 +199,11 @@ def _gram(x, w, low, high):
     # powers of the last.
     powers, xp = monomials(x[-1:], 2 * high), namespace(x)
     others = monomials(x[:-1], 2 * high) if len(x) > 1 else xp.ones_like(x)
-    moments = xp.einsum("aq...,bq...->ab...", others * w, powers)
+    factors = others * w, powers
+    if xp is jnp:
+        # Fused with the product, monomials would be found again for each of its entries.
+        factors = jax.lax.optimization_barrier(factors)
+    moments = xp.einsum("aq...,bq...->ab...", *factors)
     return moments[_gather_table(len(x), low, high)]
 
 

@@ -7,12 +7,16 @@ Section 3 (Algorithms 1 and 2) for surfaces.
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..fits.kernels import gaussian, taper
+from ..fits.lines import line_solve
 from ..fits.moments import moment_solve
 from ..fits.monomials import polynomial_count
+from ..fits.plane import dot
+from ..frames import frames_of
 from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive, with_center
 from .targets import AbstractTarget, Laplacian
 
@@ -71,24 +75,34 @@ class DCPSE(AbstractMethod):
     polynomial_degree = property(lambda self: max(self.order, 2))
 
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
-        k, dim = neighborhood.offsets.shape[:2]
+        dim = neighborhood.offsets.shape[1]
         radius = neighborhood.support(dim - 1, self.support)
         width = radius * (_width(self.order) if self.width is None else self.width)
         count = _layers(self.order) if self.layers is None else self.layers
         step = radius / (count + 0.5) if self.layer_spacing is None else self.layer_spacing
 
-        # One layer after another, the coordinate first: (d, layers * k, *p).
-        x, n = (jnp.swapaxes(a, 0, 1) for a in (neighborhood.offsets, neighborhood.normals))
-        layers = [x + m * step * n for m in range(-count, count + 1)]
-        copies = jnp.concatenate(layers, axis=1)
+        # Along the axes of the tangent frame, in which the lines of copies are steep. Any rotated
+        # axes give the same weights: these have no derivative.
+        normal = jax.lax.stop_gradient(neighborhood.normals[0])
+        length = jnp.sqrt(jnp.sum(normal**2, axis=0))
+        normal = normal / jnp.where(length > 0, length, 1)
+        frame = jnp.moveaxis(frames_of(normal.T), (-2, -1), (0, 1))
+        offsets, normals = (
+            jnp.stack([dot(a, axis[None]) for axis in frame])
+            for a in (neighborhood.offsets, neighborhood.normals)
+        )
+        copies = jnp.stack([offsets + m * step * normals for m in range(-count, count + 1)], 1)
         # On the hollow side copies are nearer than their point, so the point itself has to fade
         # as it leaves the support.
         fade = jnp.where(neighborhood.mask, taper(neighborhood.squared / radius**2), 0)
-        fade = jnp.concatenate([fade] * len(layers))
-        eta, condition, residual = _kernel(copies, fade, width, radius, target, self.order)
-        eta = jnp.sum(eta.reshape(-1, len(layers), k, *radius.shape), axis=1)
+        low, high = _degrees(target.order, self.order)
+        w = fade * gaussian(jnp.sum(copies**2, axis=0), width, radius)
+        b = jnp.asarray(target.moments(dim, low, high), w.dtype)
+        lines = jax.lax.optimization_barrier((copies / width, w))
+        eta, condition, residual = line_solve(*lines, b, low, high)
         diagnostics = Diagnostics.of(neighborhood, condition, residual, radius, count)
-        return _in_space(eta, target), diagnostics
+        eta = eta / width**target.order
+        return target.assemble(_with_center(eta, target), frame), diagnostics
 
 
 class FlatDCPSE(AbstractMethod):
@@ -132,10 +146,12 @@ class FlatDCPSE(AbstractMethod):
         x = jnp.swapaxes(neighborhood.offsets, 0, 1)
         radius = neighborhood.support(len(x), self.support)
         width = radius * (_width(self.order) if self.width is None else self.width)
-        on = neighborhood.mask.astype(x.dtype)
-        eta, condition, residual = _kernel(x, on, width, radius, target, self.order)
+        low, high = _degrees(target.order, self.order)
+        w = gaussian(jnp.sum(x**2, axis=0), width, radius, neighborhood.mask)
+        b = jnp.asarray(target.moments(len(x), low, high), x.dtype)
+        eta, condition, residual = moment_solve(x / width, w, b, low, high)
         diagnostics = Diagnostics.of(neighborhood, condition, residual, radius, 0)
-        return _in_space(eta, target), diagnostics
+        return target.components(_with_center(eta / width**target.order, target)), diagnostics
 
 
 # Neighbours to look for on a surface, by order; see `experiments` (stability study).
@@ -155,19 +171,10 @@ def _degrees(derivative: int, order: int) -> tuple[int, int]:
     return 1 - derivative % 2, derivative + order - 1
 
 
-def _kernel(x, factor, width, radius, target, order):
-    """DC-PSE kernel (eqs. 5 to 7) at the points x, of weight Gaussian times a given factor."""
-    low, high = _degrees(target.order, order)
-    w = factor * gaussian(jnp.sum(x**2, axis=0), width, radius)
-    b = jnp.asarray(target.moments(len(x), low, high), x.dtype)
-    eta, condition, residual = moment_solve(x / width, w, b, low, high)
-    return eta / width**target.order, condition, residual
-
-
-def _in_space(eta: Float[Array, "c k *p"], target: AbstractTarget):
+def _with_center(eta: Float[Array, "c k *p"], target: AbstractTarget):
     """Weights on the values themselves, from those on sums and differences with the centre.
 
     For even derivatives the kernel acts on differences (eq. 4), which takes the sum of all
     weights from the centre. For odd ones that sum is zero already: it is the moment of degree 0.
     """
-    return target.components(eta if target.order % 2 else with_center(eta))
+    return eta if target.order % 2 else with_center(eta)

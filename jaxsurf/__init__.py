@@ -24,6 +24,8 @@ from .curvature import mean_curvature_vector as mean_curvature_vector
 from .curvature import principal_curvatures as principal_curvatures
 from .curvature import shape_tensor as shape_tensor
 from .curvature import tube_ratio as tube_ratio
+from .design.taylor import TaylorRemainders as TaylorRemainders
+from .design.taylor import taylor_remainders as taylor_remainders
 from .discretization import Discretization as Discretization
 from .discretization import discretize as discretize
 from .frames import tangent_frames as tangent_frames

@@ -24,6 +24,17 @@ from .curvature import mean_curvature_vector as mean_curvature_vector
 from .curvature import principal_curvatures as principal_curvatures
 from .curvature import shape_tensor as shape_tensor
 from .curvature import tube_ratio as tube_ratio
+from .design.functionals import chamfer_distance as chamfer_distance
+from .design.functionals import compliance as compliance
+from .design.functionals import moments as moments
+from .design.functionals import volume as volume
+from .design.harmonics import spherical_harmonics as spherical_harmonics
+from .design.harmonics import star_shape as star_shape
+from .design.shape import AbstractShape as AbstractShape
+from .design.shape import LevelSetShape as LevelSetShape
+from .design.shape import MappedShape as MappedShape
+from .design.shape import NormalShape as NormalShape
+from .design.shape import rigid_motion as rigid_motion
 from .design.taylor import TaylorRemainders as TaylorRemainders
 from .design.taylor import taylor_remainders as taylor_remainders
 from .discretization import Discretization as Discretization

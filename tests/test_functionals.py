@@ -81,8 +81,7 @@ def test_derivatives_in_the_geometry():
         centroid, second = js.moments(surface)
         values = [js.volume(surface), second[0, 1] + second[0, 0], centroid[2]]
         values += [js.chamfer_distance(surface, targets), js.compliance(surface, load)]
-        values += [js.compliance(surface, load, screening=2.0)]
-        return jnp.stack(values) @ jnp.array([1.0, -0.7, 2.0, 3.0, -1.0, 5.0])
+        return jnp.stack(values) @ jnp.array([1.0, -0.7, 2.0, 3.0, -1.0])
 
     axes, direction = jnp.array([1.0, 0.9, 0.8]), jnp.array([0.3, -0.2, 0.4])
     steps = jnp.array([1e-2, 1e-3, 1e-4])

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -26,7 +28,7 @@ def spherical_harmonics(directions: Float[Array, "*n 3"], degree: int) -> Float[
         `(*n, (degree + 1)²)`, with $Y_{lm}$ in place $l^2 + l + m$; $m < 0$ with sin, $m > 0$ with
         cos of $|m|\varphi$, without the phase $(-1)^m$.
 
-    Accuracy: round-off (`tests/test_design.py::test_harmonics_are_orthonormal_eigenfunctions`).
+    Accuracy: round-off (`tests/test_design.py::test_harmonics_are_orthonormal_and_harmonic`).
     Differentiable: forward and reverse, to any order.
     Raises:
         TypeError: a degree that is no whole number, directions that are no real numbers.
@@ -39,7 +41,11 @@ def spherical_harmonics(directions: Float[Array, "*n 3"], degree: int) -> Float[
         [1.0, 0.0, 3.0, 0.0]
     """
     directions = as_float(directions, "directions", (..., 3))
-    whole(degree, "degree", least=0)
+    return _harmonics(directions, whole(degree, "degree", least=0))
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _harmonics(directions, degree: int):
     x, y, z = jnp.moveaxis(directions, -1, 0)
     found: dict[tuple[int, int], Array] = {}
     top = jnp.full_like(z, math.sqrt(1 / (4 * math.pi)))

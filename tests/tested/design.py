@@ -97,8 +97,8 @@ TESTED = {
         "bad input": "malformed",
     },
     "spherical_harmonics": {
-        "value": _SHAPE + "test_harmonics_are_orthonormal_eigenfunctions",
-        "gradient": {"directions": _SHAPE + "test_harmonics_are_orthonormal_eigenfunctions"},
+        "value": _SHAPE + "test_harmonics_are_orthonormal_and_harmonic",
+        "gradient": {"directions": _SHAPE + "test_harmonics_are_orthonormal_and_harmonic"},
         "jit": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
         "vmap": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
         "float32": _SHAPE + "test_single_precision",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from .build import blocks_of, determined, neighborhood, rows_of
@@ -29,7 +29,7 @@ def interpolated(
     u: Float[Array, "n *c"],
 ) -> Float[Array, "m *c"]:
     """Values of a field at points of the surface, refused farther away than neighbours reach."""
-    centers = _nearest_points(cloud, points)
+    centers = nearest_points(cloud.points, cloud.active, points)
     distance, reach = _distance_and_reach(cloud, neighbors, points, centers)
     text = (
         "points: {i} is {v:.3g} away from the nearest point of the cloud, farther than the "
@@ -40,13 +40,15 @@ def interpolated(
     return _summed(determined(weights, residual, degree), slots, u)
 
 
-def _nearest_points(cloud: PointCloud, points: Float[Array, "m d"]) -> Int[Array, " m"]:
-    """The active point of the cloud next to each of these."""
-    if is_concrete(cloud.points, cloud.active, points):
-        rows = np.flatnonzero(cloud.host_active)
-        tree = cKDTree(np.asarray(cloud.points, float)[rows])
+def nearest_points(
+    among: Float[Array, "n d"], on: Bool[Array, " n"] | None, points: Float[Array, "m d"]
+) -> Int[Array, " m"]:
+    """Which of some points, of those that are on, is next to each of others."""
+    if is_concrete(among, on, points):
+        rows = np.arange(len(among)) if on is None else np.flatnonzero(on)
+        tree = cKDTree(np.asarray(among, float)[rows])
         return jnp.asarray(rows[tree.query(np.asarray(points, float))[1]].astype(np.int32))
-    return _nearest(cloud.points, cloud.active, points)
+    return _nearest(jax.lax.stop_gradient(among), on, points)
 
 
 @jax.jit

@@ -65,7 +65,7 @@ def carried(gradient, normals, before, after):
     s = jnp.einsum("ntx,nx->nt", images[0], normals)
     ahead = jnp.zeros_like(normals)
     for _ in range(_TURNS):
-        normal = _crossed(_solved(a, images[1] - s[:, :, None] * ahead[:, None]))
+        normal = crossed(_solved(a, images[1] - s[:, :, None] * ahead[:, None]))
         length = jnp.sqrt(jnp.sum(normal**2, axis=1))
         normal = normal / jnp.where(length > 0, length, 1)[:, None]
         ahead = normal * (length ** (1 / (normals.shape[1] - 1)))[:, None]
@@ -81,7 +81,7 @@ def _solved(a, b):
     return jnp.einsum("tun,nux->ntx", inverse, b)
 
 
-def _crossed(tangents):
+def crossed(tangents):
     """The normal of a plane or line of tangents, as long as they are large."""
     if tangents.shape[1] == 1:
         return jnp.stack([-tangents[:, 0, 1], tangents[:, 0, 0]], axis=1)

@@ -1,0 +1,1 @@
+"""Shapes as unknowns: families with parameters, functionals, verified derivatives."""

@@ -1,0 +1,150 @@
+r"""Numbers that belong to a shape: functions of a discretisation, differentiable in its geometry.
+
+Many are a line with what a discretisation has already, and have no name here: the area
+`surface.areas.sum()`, the total mean curvature `surface.integrate(surface.mean_curvature)`, the
+Willmore energy `surface.integrate(surface.mean_curvature**2)`, eigenvalues
+`js.eigenmodes(surface.laplacian, k).values`, and a heat content is `surface.inner(w, u)` with
+u from `js.integrate`. Users' own are functions of a discretisation too.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float
+
+from ..arguments import as_float, finite, instance, real, switched_off
+from ..discretization import Discretization
+from ..failures import needs_values
+from ..interpolation import nearest_points
+from ..solve.steady import solve
+
+# Multiple of round-off that is the tolerance of solves: gradients are as exact as they are.
+_SOLVE = 100
+
+
+def volume(surface: Discretization) -> Float[Array, ""]:
+    r"""Volume inside a closed surface, $\frac1d \int_S (x - \bar x) \cdot n\,dS$; of a curve, area.
+
+    Args:
+        surface: from `js.discretize`, with normals outwards; negative where they point inwards.
+
+    Accuracy: as `surface.integrate`, $O(h^{p+1})$ (`tests/test_functionals.py`).
+    Differentiable: forward and reverse, in points and normals.
+    Raises:
+        TypeError: what is no discretisation.
+        ValueError: a surface with a border.
+
+    Example:
+        >>> surface = js.discretize(js.sphere(500), method=js.GFDM(degree=4))
+        >>> bool(abs(js.volume(surface) - 4 * jnp.pi / 3) < 1e-4)
+        True
+    """
+    _closed(surface)
+    x, normals = surface.cloud.seen.points, surface.cloud.seen.normals
+    height = jnp.sum((x - surface.mean(stop_gradient(x))) * normals, axis=1)
+    return surface.integrate(height) / surface.cloud.dim
+
+
+def moments(surface: Discretization) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
+    r"""Centroid $\bar x$ of a surface, and $\int_S (x - \bar x)(x - \bar x)^T dS$ about it.
+
+    Args:
+        surface: from `js.discretize`.
+
+    Returns:
+        Centroid `(d,)` in length, second moments `(d, d)` in length^(d+1). Divided by the area
+        they are the covariance of a random point; $\operatorname{tr}(M) I - M$ is the tensor of
+        inertia of a shell.
+
+    Accuracy: as `surface.integrate` (`tests/test_functionals.py`).
+    Differentiable: forward and reverse, in points and normals.
+    Raises:
+        TypeError: what is no discretisation.
+
+    Example:
+        >>> centroid, second = js.moments(js.discretize(js.sphere(500), method=js.GFDM(degree=4)))
+        >>> bool(jnp.allclose(second, 4 * jnp.pi / 3 * jnp.eye(3), atol=1e-3))
+        True
+    """
+    instance(surface, Discretization, "surface", "js.discretize(cloud) makes one")
+    x = surface.cloud.seen.points
+    centroid = surface.mean(x)
+    about = x - centroid
+    return centroid, surface.integrate(about[:, :, None] * about[:, None, :])
+
+
+def compliance(
+    surface: Discretization, f: Float[Array, " n"], *, screening: float = 0.0
+) -> Float[Array, ""]:
+    r"""$\int_S f u\,dS$ with $-\Delta u + \kappa u = f$: how far a load f moves where it acts.
+
+    Args:
+        surface: from `js.discretize`, closed.
+        f: load, `(n,)`.
+        screening: $\kappa \ge 0$ in 1/length², not traced; without it f stands for f less its mean.
+
+    Accuracy: that of the Laplacian (`tests/test_functionals.py`).
+    Differentiable: forward and reverse, in points, normals and f, by the implicit function theorem.
+    Raises:
+        TypeError: what is no discretisation, a load or a screening that is not made of numbers.
+        ValueError: a load of another shape, a negative or traced screening, a surface with a border
+            (solve with `js.solve` and conditions there).
+        RuntimeError: the linear solve failed.
+
+    Example:
+        >>> surface = js.discretize(js.sphere(500), method=js.GFDM(degree=4))
+        >>> z = surface.cloud.points[:, 2]  # the solution is z / 2
+        >>> bool(abs(js.compliance(surface, z) - 2 * jnp.pi / 3) < 1e-2)
+        True
+    """
+    _closed(surface)
+    f = as_float(f, "load", (surface.n,))
+    real(screening, "screening", least=0)
+    needs_values("screening", screening, instead="give a number from outside")
+    free = float(screening) == 0
+    if free:
+        f = f - surface.mean(f)
+    operator = -surface.laplacian if free else -surface.laplacian + screening
+    rtol = _SOLVE * float(jnp.finfo(f.dtype).eps)
+    u = solve(operator, f, mean_zero=free, project=free, rtol=rtol).value
+    return surface.inner(f, u)
+
+
+def chamfer_distance(surface: Discretization, targets: Float[Array, "m d"]) -> Float[Array, ""]:
+    r"""Mean squared distances from the surface to the nearest of some points, and from these to it.
+
+    $\frac1{|S|}\int_S \min_j |x - y_j|^2 dS + \frac1m \sum_j \min_i |x_i - y_j|^2$.
+
+    Args:
+        surface: from `js.discretize`.
+        targets: points $y_j$, `(m, d)`.
+
+    Differentiable: forward and reverse, in points, normals and targets, for fixed nearest points.
+    Raises:
+        TypeError: what is no discretisation or array of numbers.
+        ValueError: targets of another shape, none, or not finite.
+
+    Example:
+        >>> surface = js.discretize(js.sphere(500))
+        >>> bool(js.chamfer_distance(surface, surface.cloud.points) == 0)
+        True
+    """
+    instance(surface, Discretization, "surface", "js.discretize(cloud) makes one")
+    targets = finite(as_float(targets, "targets", ("m", surface.cloud.dim)), "targets")
+    if not len(targets):
+        raise ValueError(f"targets have shape {targets.shape}, at least 1 point is needed")
+    x, on = surface.cloud.points, surface.cloud.active
+    seen = surface.cloud.seen.points
+    there = seen - targets[nearest_points(targets, None, seen)]
+    back = targets - x[nearest_points(x, on, targets)]
+    squared = lambda v: jnp.sum(v**2, axis=1)
+    return surface.mean(switched_off(on, squared(there))) + jnp.mean(squared(back))
+
+
+def _closed(surface):
+    """Refuse what is no discretisation of a closed surface."""
+    instance(surface, Discretization, "surface", "js.discretize(cloud) makes one")
+    if surface.border is not None:
+        count = len(surface.border.points)
+        raise ValueError(f"surface has {count} points on its border, expected a closed one")

@@ -1,0 +1,231 @@
+"""Shapes with parameters: θ ↦ a discretisation, differentiable, with the arrays of a reference."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from ..arguments import as_float, differentiable, instance, switched_off
+from ..discretization import Discretization
+from ..failures import check, not_positive
+from ..frames import frames_of
+from ..functions import Traced, canonical
+from ..motion import crossed
+from ..shapes.implicit import level_set_normals, project_to_level_set
+
+
+class AbstractShape(eqx.Module):
+    r"""A family of surfaces: `shape(theta)` is the discretisation that belongs to $\theta$.
+
+    Its points are those of a reference moved along, its neighbours those of the reference: all
+    arrays keep their shapes, and nothing jumps. A shape of one's own moves a surface likewise.
+
+    Example:
+        >>> class Scaled(js.AbstractShape):
+        ...     surface: js.Discretization
+        ...
+        ...     def __call__(self, theta):
+        ...         cloud = self.surface.cloud
+        ...         return self.surface.moved(theta * cloud.points, cloud.normals)
+        >>> shape = Scaled(js.discretize(js.sphere(500), method=js.GFDM(degree=4)))
+        >>> area = lambda theta: shape(theta).areas.sum()
+        >>> bool(abs(jax.grad(area)(2.0) - 16 * jnp.pi) < 1e-3)
+        True
+    """
+
+    @abc.abstractmethod
+    def __call__(self, theta: PyTree) -> Discretization:
+        r"""The discretisation at $\theta$, under `jit`, `vmap` and `grad`; see `surface.moved`.
+
+        Raises:
+            ValueError: as `surface.moved`; under `jit`, `vmap` and `grad` see its `code`.
+        """
+
+
+class LevelSetShape(AbstractShape):
+    r"""The level sets $\{x : \phi(x, \theta) = 0\}$, of neural networks too.
+
+    Points are those of the reference moved along $\nabla\phi$ onto the level set; their
+    derivatives in $\theta$ follow by the implicit function theorem. Normals are exact.
+
+    Args:
+        phi: function of one point `(d,)` and of parameters, any pytree (an `eqx.nn.MLP`, say,
+            under `eqx.filter_grad` and `eqx.filter_jit`).
+        surface: of a level set nearby, as of `js.level_set(lambda x: phi(x, theta0), ...)`.
+
+    Differentiable: forward and reverse in theta, for fixed neighbours.
+    Raises:
+        TypeError: phi that is no function, a surface that is no discretisation.
+        ValueError: at a theta for which points do not reach the level set, named by point; under
+            `jit`, `vmap` and `grad` they are NaN, with code 1.
+
+    Example:
+        >>> phi = lambda x, axes: jnp.sum((x / axes) ** 2) - 1
+        >>> axes = jnp.array([1.0, 0.8, 0.7])
+        >>> surface = js.discretize(js.ellipsoid(300, axes), method=js.GFDM(degree=2))
+        >>> shape = js.LevelSetShape(phi, surface)
+        >>> height = lambda axes: shape(axes).cloud.points[:, 2].max()
+        >>> bool(jax.grad(height)(axes)[2] > 0.9)
+        True
+    """
+
+    phi: Callable[[Float[Array, " d"], PyTree], Float[Array, ""]]
+    surface: Discretization
+
+    def __check_init__(self):
+        _function(self.phi, "phi")
+        _surface(self.surface)
+
+    def __call__(self, theta: PyTree) -> Discretization:
+        phi = lambda x: self.phi(x, theta)
+        cloud = self.surface.cloud
+        # A switched-off point goes where another goes, and stays where it is.
+        start = cloud.points
+        if cloud.active is not None:
+            start = switched_off(cloud.active, start, start[jnp.argmax(cloud.active)])
+        points = project_to_level_set(phi, start)
+        return self.surface.moved(points, level_set_normals(phi, points))
+
+
+class MappedShape(AbstractShape):
+    r"""A reference surface, or another shape, under a map with parameters.
+
+    Points are $f(x, \theta)$, normals $\propto F t_1 \times F t_2$ with F the derivative of f and
+    t the tangents before, exactly. So are parametric surfaces (x a surface that parametrises
+    them), rigid (`js.rigid_motion`) and affine maps (`lambda x, theta: theta[0] @ x + theta[1]`),
+    and stars (`js.star_shape`). Of a shape, the parameters are its own and those of the map:
+    `MappedShape(f, shape)((theta, theta_f))`. Maps that reflect turn normals inwards.
+
+    Args:
+        f: takes one point `(d,)` and parameters, any pytree; returns a point.
+        base: what it is applied to.
+
+    Differentiable: forward and reverse in theta, for fixed neighbours.
+    Raises:
+        TypeError: f that is no function, a base that is neither discretisation nor shape.
+        ValueError: at a theta for which f returns no point, or folds or flattens the surface.
+
+    Example:
+        >>> surface = js.discretize(js.sphere(500), method=js.GFDM(degree=4))
+        >>> stretched = js.MappedShape(lambda x, axes: axes * x, surface)
+        >>> volume = lambda axes: js.volume(stretched(axes))
+        >>> slopes = jax.grad(volume)(jnp.array([1.0, 2.0, 1.0]))
+        >>> bool(jnp.allclose(slopes, 4 * jnp.pi / 3 * jnp.array([2, 1, 2]), rtol=1e-3))
+        True
+    """
+
+    f: Callable[[Float[Array, " d"], PyTree], Float[Array, " d"]]
+    base: Discretization | AbstractShape
+
+    def __check_init__(self):
+        _function(self.f, "f")
+        instance(self.base, (Discretization, AbstractShape), "base", "js.discretize makes one")
+
+    def __call__(self, theta: PyTree) -> Discretization:
+        if isinstance(self.base, AbstractShape):
+            own, theta = theta
+            surface = self.base(own)
+        else:
+            surface = self.base
+        points, normals = surface.cloud.seen.points, surface.cloud.seen.normals
+        point = jax.ShapeDtypeStruct(points.shape[1:], points.dtype)
+        apply = lambda x: self.f(x, theta)
+        found = differentiable(apply, "f", point)
+        if getattr(found, "shape", None) != point.shape:
+            what = getattr(found, "shape", type(found).__name__)
+            raise ValueError(f"f returns {what} for one point, expected {point.shape}")
+        program = canonical(apply, jnp.zeros(point.shape, point.dtype))
+        images, normals, area = _mapped(program, points, frames_of(normals)[:, :-1])
+        text = "f flattens the surface at point {i}: it stretches areas there by {v}"
+        on = surface.cloud.active
+        check(switched_off(on, area, 1), not_positive, text)
+        return surface.moved(images, switched_off(on, normals, surface.cloud.normals))
+
+
+@eqx.filter_jit
+def _mapped(f: Traced, points, tangents):
+    """Images of points, unit normals there, and how f stretches areas."""
+
+    def single(x, tangents):
+        images, moved = jax.vmap(lambda t: jax.jvp(f, (x,), (t,)))(tangents)
+        return images[0], moved
+
+    images, moved = jax.vmap(single)(points, tangents)
+    normals = crossed(moved)
+    area = jnp.sqrt(jnp.sum(normals**2, axis=1))
+    return images, normals / area[:, None], area
+
+
+class NormalShape(AbstractShape):
+    r"""Free form: the points of a reference moved along its normals, $x + \theta n$.
+
+    Args:
+        surface: the reference. Parameters are one displacement for each point, `(n,)`, in units
+            of length, which should be smooth over a few points; normals are carried along.
+
+    Accuracy: normals as `surface.gradient`, $O(h^p)$.
+    Differentiable: forward and reverse in theta, for fixed neighbours.
+    Raises:
+        TypeError: a surface that is no discretisation, displacements that are no real numbers.
+        ValueError: displacements of another shape, or that fold the surface.
+
+    Example:
+        >>> shape = js.NormalShape(js.discretize(js.sphere(500), method=js.GFDM(degree=4)))
+        >>> bool(abs(js.volume(shape(jnp.ones(500))) - 32 * jnp.pi / 3) < 1e-2)
+        True
+    """
+
+    surface: Discretization
+
+    def __check_init__(self):
+        _surface(self.surface)
+
+    def __call__(self, theta: Float[Array, " n"]) -> Discretization:
+        theta = as_float(theta, "displacements", (self.surface.n,))
+        cloud = self.surface.cloud
+        return self.surface.moved(cloud.points + theta[:, None] * cloud.normals)
+
+
+def rigid_motion(
+    x: Float[Array, " d"], theta: tuple[Float[Array, "..."], Float[Array, " d"]]
+) -> Float[Array, " d"]:
+    r"""A point turned about the origin, then shifted: for `MappedShape`.
+
+    Args:
+        x: `(d,)`.
+        theta: rotation, and shift `(d,)`. In space the rotation is a vector `(3,)` along the axis,
+            as long as the angle; in the plane an angle `()`. Smooth everywhere, at 0 too.
+
+    Differentiable: forward and reverse in theta and x, to any order.
+    Raises:
+        ValueError: a rotation or shift of another shape.
+
+    Example:
+        >>> quarter = jnp.array([0.0, 0.0, jnp.pi / 2]), jnp.array([0.0, 0.0, 1.0])
+        >>> js.rigid_motion(jnp.array([1.0, 0.0, 0.0]), quarter).round(6).tolist()
+        [0.0, 1.0, 1.0]
+    """
+    x = as_float(x, "x", (2,), (3,))
+    turn, shift = theta
+    turn = as_float(turn, "rotation", () if len(x) == 2 else (3,))
+    shift = as_float(shift, "shift", x.shape)
+    if len(x) == 2:
+        matrix = jnp.array([[0.0, -1.0], [1.0, 0.0]], turn.dtype) * turn
+    else:
+        matrix = jnp.cross(turn, jnp.eye(3, dtype=turn.dtype)).T
+    return jax.scipy.linalg.expm(matrix) @ x + shift
+
+
+def _function(f: Any, name: str) -> None:
+    if not callable(f):
+        raise TypeError(f"{name} is a {type(f).__name__}, expected a function of x and theta")
+
+
+def _surface(surface: Any) -> None:
+    instance(surface, Discretization, "surface", "js.discretize(cloud) makes one")

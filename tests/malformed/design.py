@@ -1,0 +1,92 @@
+"""Shapes as unknowns, and derivatives held against differences."""
+
+# One case a line reads as a table.
+# ruff: noqa: E501
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxsurf as js
+
+from . import Case
+
+X = jnp.array([1.0, 2.0, 3.0])
+
+
+@functools.cache
+def surface() -> js.Discretization:
+    cloud = js.sphere(80)
+    return js.discretize(cloud, js.find_neighbors(cloud, k=36), method=js.GFDM(degree=2))
+
+
+@functools.cache
+def cap() -> js.Discretization:
+    cloud = js.surface_of_revolution(lambda s: (jnp.sin(s), -jnp.cos(s)), 120)
+    return js.discretize(cloud, method=js.GFDM(degree=2))
+
+
+def level_set():
+    return js.LevelSetShape(lambda x, level: x @ x + level, surface())
+
+
+def mapped(f):
+    return lambda: js.MappedShape(f, surface())(1.0)
+
+
+def taylor(f=lambda x: jnp.sum(jnp.sin(x)), x=X, direction=X, **options):
+    return lambda: js.taylor_remainders(f, x, direction, **options)
+
+
+CALLS = [
+    ("taylor_remainders", "f a number", taylor(f=1.0), ("f is a float", "function")),
+    ("taylor_remainders", "f with several values", taylor(f=jnp.sin), ("f returns", "(3,)", "one real number")),
+    ("taylor_remainders", "f a complex value", taylor(f=lambda x: jnp.sum(1j * x)), ("f returns", "complex128", "one real number")),
+    ("taylor_remainders", "a value that is not finite", taylor(f=lambda x: jnp.sum(x) / 0), ("f(x) is not finite", "inf")),
+    ("taylor_remainders", "not finite beside x", taylor(f=lambda x: jnp.sqrt(1 - x[0])), ("derivative of f", "not finite")),
+    ("taylor_remainders", "whole numbers", taylor(x=jnp.arange(3)), ("x has a leaf of type int64", "floating")),
+    ("taylor_remainders", "text", taylor(x="abc"), ("x has a leaf", "str")),
+    ("taylor_remainders", "nothing", taylor(x=()), ("x has no arrays",)),
+    ("taylor_remainders", "a direction of another shape", taylor(direction=X[:2]), ("direction has shapes (2,)", "(3,)")),
+    ("taylor_remainders", "a direction of another structure", taylor(direction=(X,)), ("direction has shapes ((3,),)", "(3,)")),
+    ("taylor_remainders", "a direction that is not finite", taylor(direction=X * np.nan), ("direction is not finite",)),
+    ("taylor_remainders", "a step of zero", taylor(steps=[0.1, 0.0]), ("step 1 is 0.0", "positive")),
+    ("taylor_remainders", "one step", taylor(steps=[0.1]), ("1 different steps", "at least 2")),
+    ("taylor_remainders", "traced", lambda: jax.jit(lambda x: taylor(x=x)().slope)(X), ("x and direction", "traced")),
+    *((name, "a cloud", lambda name=name, more=more: getattr(js, name)(surface().cloud, *more), ("surface", "Discretization")) for name, more in (("volume", ()), ("moments", ()), ("compliance", (X,)), ("chamfer_distance", (X,)), ("star_shape", (2,)), ("NormalShape", ()))),
+    *((name, "text", lambda name=name, more=more: getattr(js, name)("ball", *more), ("surface is 'ball'", "Discretization")) for name, more in (("volume", ()), ("moments", ()), ("star_shape", (2,)), ("NormalShape", ()))),
+    ("moments", "nothing", lambda: js.moments(None), ("surface is None", "Discretization")),
+    ("volume", "a border", lambda: js.volume(cap()), ("border", "closed")),
+    ("compliance", "a border", lambda: js.compliance(cap(), jnp.ones(120)), ("border", "closed")),
+    ("compliance", "a load of others", lambda: js.compliance(surface(), X), ("load", "(3,)", "(80,)")),
+    ("compliance", "a screening below zero", lambda: js.compliance(surface(), jnp.ones(80), screening=-1.0), ("screening = -1", "at least 0")),
+    ("compliance", "a screening that is traced", lambda: jax.grad(lambda s: js.compliance(surface(), jnp.ones(80), screening=s))(1.0), ("screening", "traced")),
+    *((name, label, lambda name=name, points=points: getattr(js, name)(surface(), points), words) for name, word in (("chamfer_distance", "targets"),) for label, points, words in (
+        ("points in the plane", jnp.ones((5, 2)), (word, "(5, 2)", "3")),
+        ("no points", jnp.ones((0, 3)), (word, "(0, 3)", "at least 1")),
+        ("a point that is not finite", jnp.ones((5, 3)).at[2].set(jnp.nan), (word, "point 2")),
+    )),
+    ("LevelSetShape", "a number for phi", lambda: js.LevelSetShape(1.0, surface()), ("phi is a float", "function")),
+    ("LevelSetShape", "a cloud", lambda: js.LevelSetShape(lambda x, a: x @ x - a, surface().cloud), ("surface", "Discretization")),
+    ("LevelSetShape", "an empty level set", lambda: level_set()(1.0), ("point 0", "did not converge")),
+    ("LevelSetShape", "phi with several values", lambda: js.LevelSetShape(lambda x, a: a * x, surface())(1.0), ("phi must return a scalar", "(3,)")),
+    ("MappedShape", "a matrix for f", lambda: js.MappedShape(jnp.eye(3), surface()), ("f is a", "function")),
+    ("MappedShape", "a cloud", lambda: js.MappedShape(lambda x, a: a * x, surface().cloud), ("base", "Discretization or Shape")),
+    ("MappedShape", "f returns a number", mapped(lambda x, a: a * x[0]), ("f returns ()", "(3,)")),
+    ("MappedShape", "f with NumPy", mapped(lambda x, a: np.sin(x)), ("f cannot be traced", "jax.numpy")),
+    ("MappedShape", "f flattens", mapped(lambda x, a: 0 * x), ("f flattens", "point 0")),
+    ("NormalShape", "displacements of others", lambda: js.NormalShape(surface())(X), ("displacements", "(3,)", "(80,)")),
+    ("NormalShape", "text for displacements", lambda: js.NormalShape(surface())("far"), ("displacements", "'far'")),
+    ("star_shape", "half a degree", lambda: js.star_shape(surface(), 2.5), ("degree is 2.5", "whole number")),
+    ("star_shape", "too few coefficients", lambda: js.star_shape(surface(), 2)(X), ("theta", "(3,)", "(9,)")),
+    ("spherical_harmonics", "points in the plane", lambda: js.spherical_harmonics(jnp.ones((5, 2)), 2), ("directions", "(5, 2)", "3")),
+    ("spherical_harmonics", "a degree below zero", lambda: js.spherical_harmonics(X, -1), ("degree = -1", "at least 0")),
+    ("spherical_harmonics", "half a degree", lambda: js.spherical_harmonics(X, 1.5), ("degree is 1.5", "whole number")),
+    ("rigid_motion", "an angle in space", lambda: js.rigid_motion(X, (0.3, X)), ("rotation", "()", "(3,)")),
+    ("rigid_motion", "a shift in the plane", lambda: js.rigid_motion(X, (X, X[:2])), ("shift", "(2,)", "(3,)")),
+    ("rigid_motion", "many points", lambda: js.rigid_motion(jnp.ones((5, 3)), (X, X)), ("x has shape (5, 3)", "(3,)")),
+]  # fmt: skip
+
+CASES = [Case(*case) for case in CALLS]

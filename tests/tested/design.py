@@ -1,0 +1,107 @@
+"""Shapes as unknowns."""
+
+_TAYLOR = "test_taylor.py::"
+_FUN, _SHAPE = "test_functionals.py::", "test_design.py::"
+_CURVES = _FUN + "test_curves_compiled_mapped_and_in_single_precision"
+_MOVED = {"points, normals": _FUN + "test_derivatives_in_the_geometry"}
+_HOST = "(host only: concrete arrays)"
+
+TESTED = {
+    "taylor_remainders": {
+        "value": _TAYLOR + "test_slopes_of_right_and_wrong_derivatives, "
+        "test_taylor.py::test_linear_functions_leave_nothing",
+        "gradient": "(it is about derivatives)",
+        "jit": _HOST,
+        "vmap": _HOST,
+        "float32": _TAYLOR + "test_slopes_of_right_and_wrong_derivatives",
+        "bad input": "malformed",
+    },
+    "TaylorRemainders": {
+        "value": _TAYLOR + "test_what_it_shows",
+        "gradient": "(made by taylor_remainders)",
+        "jit": _HOST,
+        "vmap": _HOST,
+        "float32": _TAYLOR + "test_slopes_of_right_and_wrong_derivatives",
+        "bad input": "(made by taylor_remainders)",
+    },
+    "volume": {
+        "value": _FUN + "test_values_and_shape_derivatives_on_the_torus",
+        "gradient": _MOVED,
+        "jit": _CURVES,
+        "vmap": _CURVES,
+        "float32": _CURVES,
+        "bad input": "malformed",
+    },
+    "moments": {
+        "value": _FUN + "test_values_and_shape_derivatives_on_the_torus",
+        "gradient": _MOVED,
+        "jit": _CURVES,
+        "vmap": _CURVES,
+        "float32": _CURVES,
+        "bad input": "malformed",
+    },
+    "compliance": {
+        "value": _FUN + "test_compliance_of_the_ball",
+        "gradient": {**_MOVED, "f": _FUN + "test_compliance_of_the_ball"},
+        "jit": _CURVES,
+        "vmap": _CURVES,
+        "float32": _CURVES,
+        "bad input": "malformed",
+    },
+    "chamfer_distance": {
+        "value": _FUN + "test_distances",
+        "gradient": {**_MOVED, "targets": _FUN + "test_distances"},
+        "jit": _CURVES,
+        "vmap": _CURVES,
+        "float32": _CURVES,
+        "bad input": "malformed",
+    },
+    "LevelSetShape": {
+        "value": _SHAPE + "test_points_and_normals_are_those_of_the_shape",
+        "gradient": {"theta": _SHAPE + "test_derivatives_are_differences_of_shapes_made_anew"},
+        "jit": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
+        "vmap": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
+        "float32": _SHAPE + "test_single_precision",
+        "bad input": "malformed",
+    },
+    "MappedShape": {
+        "value": _SHAPE + "test_points_and_normals_are_those_of_the_shape",
+        "gradient": {"theta": _SHAPE + "test_derivatives_are_differences_of_shapes_made_anew"},
+        "jit": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
+        "vmap": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
+        "float32": _SHAPE + "test_single_precision",
+        "bad input": "malformed",
+    },
+    "NormalShape": {
+        "value": _SHAPE + "test_derivatives_are_differences_of_shapes_made_anew",
+        "gradient": {"theta": _SHAPE + "test_derivatives_are_differences_of_shapes_made_anew"},
+        "jit": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
+        "vmap": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
+        "float32": _SHAPE + "test_single_precision",
+        "bad input": "malformed",
+    },
+    "star_shape": {
+        "value": _SHAPE + "test_derivatives_are_differences_of_shapes_made_anew",
+        "gradient": {"theta": _SHAPE + "test_derivatives_are_differences_of_shapes_made_anew"},
+        "jit": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
+        "vmap": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
+        "float32": _SHAPE + "test_single_precision",
+        "bad input": "malformed",
+    },
+    "rigid_motion": {
+        "value": _SHAPE + "test_rotations_are_smooth_at_none",
+        "gradient": {"theta, x": _SHAPE + "test_rotations_are_smooth_at_none"},
+        "jit": _SHAPE + "test_rotations_are_smooth_at_none",
+        "vmap": _SHAPE + "test_rotations_are_smooth_at_none",
+        "float32": _SHAPE + "test_single_precision",
+        "bad input": "malformed",
+    },
+    "spherical_harmonics": {
+        "value": _SHAPE + "test_harmonics_are_orthonormal_and_harmonic",
+        "gradient": {"directions": _SHAPE + "test_harmonics_are_orthonormal_and_harmonic"},
+        "jit": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
+        "vmap": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
+        "float32": _SHAPE + "test_single_precision",
+        "bad input": "malformed",
+    },
+}

@@ -335,6 +335,12 @@ def carried(c: Case):
     return found.clouds[-1].points[c.rows], found.fields[-1]
 
 
+def measured(c: Case):
+    targets = np.array([[1.5, 0.0, 0.2], [0.0, -1.2, 0.4]])
+    s, u = c.surface, c.u
+    return js.volume(s), js.moments(s), js.compliance(s, u), js.chamfer_distance(s, targets)
+
+
 def adapted(c: Case, **options):
     problem = js.AdvectionDiffusionReaction(c.laplacian, reaction=lambda t, u, args: 1 - u)
     found = js.integrate(problem, c.u, t1=0.05, **options)
@@ -513,6 +519,7 @@ TABLE = {
     "controller": Row(lambda c: adapted(c, solver=dfx.Tsit5(), atol=0.0), SOLVED, core=True),
     "AdvectionDiffusionReaction": Row(advected),
     "evolve": Row(carried, SOLVED),
+    "volume": Row(measured, SOLVED),
     "BiharmonicDiffusion": Row(
         lambda c: evolved(c, js.BiharmonicDiffusion(c.laplacian), solver=js.IMEX(order=2)), SOLVED
     ),
@@ -552,6 +559,7 @@ BESIDE = {
     "AbstractPreconditioner": "jacobi", "AbstractEvolution": "integrate",
     "Motion": "evolve", "AbstractMotion": "evolve", "MeanCurvatureFlow": "evolve",
     "Evolution": "evolve",
+    "moments": "volume", "compliance": "volume", "chamfer_distance": "volume",
 }  # fmt: skip
 
 # Take bare points, of which none can be switched off, or none at all.
@@ -564,6 +572,11 @@ EXEMPT = {
         "surface_of_revolution", "torus",
     },
     "meshes": {"TriangleMesh", "clean_mesh", "sample_mesh"},
+    "moves the points of a surface, as `moved` does": {
+        "AbstractShape", "LevelSetShape", "MappedShape", "NormalShape", "rigid_motion",
+        "star_shape", "spherical_harmonics",
+    },
+    "takes any function": {"taylor_remainders", "TaylorRemainders"},
     "looks at the kind of a problem": {"choose_solver"},
     "an error": {"IntegrationError"},
     "names points that are on": {"free"},

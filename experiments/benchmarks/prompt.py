@@ -108,6 +108,22 @@ def _cubic(t, u, args):
     return u - u**3
 
 
+def _inflated(t, surface, fields, args):
+    return args * surface.cloud.normals
+
+
+def _last(evolution):
+    return evolution.clouds[-1].points
+
+
+def _heat(surface):
+    return js.AdvectionDiffusionReaction(surface.laplacian)
+
+
+def _quartic(u):
+    return jnp.sum(u**4)
+
+
 class Made:
     """What calls need; each thing is made when it is first asked for."""
 
@@ -185,6 +201,47 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
         lambda m: m.surface.interpolate(m.u, m.cloud.points[::2]),
     ),
     "moved": ("closed", "surface", lambda m: m.surface.moved(1.1 * m.cloud.points).laplacian),
+    "evolve": (
+        "closed",
+        "surface",
+        lambda m: _last(js.evolve(js.Motion(_inflated), m.surface, t1=0.1, args=m.number)),
+    ),
+    "evolve, heat": (
+        "closed",
+        "surface",
+        lambda m: js.evolve(
+            js.Motion(_inflated), m.surface, t1=0.01, fields=m.u, problem=_heat, args=m.number
+        ).fields[-1],
+    ),
+    "evolve, MeanCurvatureFlow": (
+        "closed",
+        "surface",
+        lambda m: _last(js.evolve(js.MeanCurvatureFlow(), m.surface, t1=0.01 * m.number)),
+    ),
+    "volume": ("closed", "surface", lambda m: js.volume(m.surface)),
+    "moments": ("closed", "surface", lambda m: js.moments(m.surface)),
+    "compliance": ("closed", "surface", lambda m: js.compliance(m.surface, m.u)),
+    "chamfer_distance": (
+        "closed",
+        "surface",
+        lambda m: js.chamfer_distance(m.surface, 1.1 * m.cloud.points[::2]),
+    ),
+    "star_shape": (
+        "closed",
+        "surface",
+        lambda m: js.star_shape(m.surface, 2)(m.number * np.eye(9)[0]).cloud.points,
+    ),
+    "rigid_motion": (
+        "closed",
+        "",
+        lambda m: js.rigid_motion(m.cloud.points[0], (m.number * np.ones(3), np.ones(3))),
+    ),
+    "spherical_harmonics": ("closed", "", lambda m: js.spherical_harmonics(m.cloud.points, 4)),
+    "taylor_remainders": (
+        "closed",
+        "",
+        lambda m: js.taylor_remainders(_quartic, m.u, m.number * jnp.cos(m.u)).slope,
+    ),
     "conservative_weights": (
         "closed",
         "laplacian",

@@ -20,7 +20,7 @@ from ..interpolation import nearest_points
 from ..solve.steady import solve
 
 # Multiple of round-off that is the tolerance of solves: gradients are as exact as they are.
-_SOLVE = 100
+_SOLVE = 1e4
 
 
 def volume(surface: Discretization) -> Float[Array, ""]:

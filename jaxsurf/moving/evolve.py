@@ -208,6 +208,7 @@ class _Worn(eqx.Module):
 def _followed(moving: Moving, state, t, times, options) -> Evolution:
     surfaces, saved, steps, renewals = [], [], np.zeros(2, int), 0
     search, why = None, ""
+    times = np.asarray(times, state[0].dtype)  # as the steps reach them
     for target in times:
         while float(t) < float(target):
             event = dfx.Event(_Worn(moving.surface))
@@ -223,7 +224,7 @@ def _followed(moving: Moving, state, t, times, options) -> Evolution:
         surfaces.append(moving.surface_at(state[0]))
         saved.append(moving.fields(target, state))
     stats = {"steps": int(steps[0]), "refused": int(steps[1]), "renewals": renewals, "solver": why}
-    return Evolution(jnp.asarray(times, state[0].dtype), surfaces, saved, stats)
+    return Evolution(jnp.asarray(times), surfaces, saved, stats)
 
 
 def _renewed(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxsurf.fits.kernels import gaussian, support, taper
+from jaxsurf.fits.lines import are_steep, line_solve
 from jaxsurf.fits.moments import blockwise, in_blocks, moment_solve, out_of_blocks
 from jaxsurf.fits.monomials import differentiation, monomials, multi_indices
 from jaxsurf.stencils.targets import Gradient, Hessian, Laplacian, Partial
@@ -152,3 +153,35 @@ def test_derivative_of_support():
     r2 = jnp.asarray(np.sort(np.random.default_rng(0).uniform(0, 1, 30)))
     r2 = r2.at[0].set(0)
     check_derivative(lambda r: support(r, jnp.ones(30, bool), dim=2), r2, rtol=1e-7)
+
+
+@pytest.mark.parametrize("dim, flat", [(2, False), (3, False), (3, True)])
+def test_lines_have_the_weights_of_their_points(dim, flat):
+    """Steep lines are followed by their last coordinate, flatter ones point by point."""
+    rng = np.random.default_rng(dim)
+    count, lines, low, high = 5, 24, 1, 3
+    along = rng.normal(size=(dim, 1, lines, 2)) * 0.2
+    along[-1] = 0.05 if flat else 1
+    steps = np.linspace(-0.8, 0.8, count).reshape(1, count, 1, 1)
+    x = jnp.asarray(rng.uniform(-1, 1, (dim, 1, lines, 2)) + steps * along)
+    w = jnp.exp(-jnp.sum(x**2, axis=0)) * (np.arange(lines) < lines - 3)[:, None]
+    b = jnp.asarray(rng.normal(size=(len(multi_indices(dim, low, high)), 2)))
+    assert bool(are_steep(x, w)) != flat
+
+    def one_by_one(x, w):
+        every = x.reshape(dim, -1, 2), w.reshape(-1, 2)
+        wide = jnp.broadcast_to(b[:, :, None], (*b.shape, 2))
+        eta, condition, _ = moment_solve(*every, wide, low, high)
+        return jnp.sum(eta.reshape(2, count, lines, 2), axis=1), condition
+
+    def by_lines(x, w):
+        return line_solve(x, w, b, low, high)[:2]
+
+    ways = (jnp.asarray(rng.normal(size=x.shape)), w * rng.normal(size=w.shape))
+    (want, condition), (d_want, _) = jax.jit(lambda: jax.jvp(one_by_one, (x, w), ways))()
+    (have, other), (d_have, _) = jax.jit(lambda: jax.jvp(by_lines, (x, w), ways))()
+    slack = 10 * float(jnp.max(condition)) * np.finfo(float).eps
+    np.testing.assert_allclose(other, condition, rtol=1e-6)
+    for a, c in ((have, want), (d_have, d_want)):
+        assert float(jnp.max(jnp.abs(a - c))) < slack * float(jnp.max(jnp.abs(c)))
+    assert not have[:, -3:].any()

@@ -254,8 +254,10 @@ def point_indices(indices: Any, name: str, *, axes: str, n: int) -> Any:
     points = np.arange(count).reshape((-1, 1) if n == 0 else (1, -1))
     points = np.broadcast_to(points, indices.shape)
     text = f"{name} of point {{i}} name point {{v}}, there are {count}"
-    wide = indices.astype(jnp.promote_types(indices.dtype, jnp.int32))
-    return refuse(indices, (wide < 0) | (wide >= count), text, indices, points=points)
+    # What is known is looked at on the host: it stays known in compiled code, and compiles nothing.
+    seen = np.asarray(indices) if is_concrete(indices) else indices
+    wide = seen.astype(jnp.promote_types(indices.dtype, jnp.int32))
+    return refuse(indices, (wide < 0) | (wide >= count), text, seen, points=points)
 
 
 # Shapes of points and of vectors at them.

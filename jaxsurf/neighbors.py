@@ -64,7 +64,8 @@ class Neighbors(eqx.Module):
         if self.mask.dtype != bool:
             raise TypeError(f"mask is {self.mask.dtype}, expected bool")
         shaped(self.mask, "mask", indices.shape)
-        first, text = indices[:, 0], "slot 0 of row {i} names point {v}, expected {i}"
+        first = (np.asarray(indices) if is_concrete(indices) else indices)[:, 0]
+        text = "slot 0 of row {i} names point {v}, expected {i}"
         indices = refuse(indices, first != np.arange(self.n), text, first)
         object.__setattr__(self, "indices", indices)  # with the errors of compiled code
         if is_concrete(indices, self.mask):

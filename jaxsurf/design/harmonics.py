@@ -28,7 +28,8 @@ def spherical_harmonics(directions: Float[Array, "*n 3"], degree: int) -> Float[
         `(*n, (degree + 1)²)`, with $Y_{lm}$ in place $l^2 + l + m$; $m < 0$ with sin, $m > 0$ with
         cos of $|m|\varphi$, without the phase $(-1)^m$.
 
-    Accuracy: round-off (`tests/test_design.py::test_harmonics_are_orthonormal_and_harmonic`).
+    Accuracy: round-off (`tests/test_design.py::test_harmonics_are_orthonormal_and_harmonic`); in
+        float32 stars of degree 4 are within 1e-5.
     Differentiable: forward and reverse, to any order.
     Raises:
         TypeError: a degree that is no whole number, directions that are no real numbers.
@@ -77,6 +78,8 @@ def star_shape(surface: Discretization, degree: int) -> MappedShape:
         The shape with parameters `((degree + 1)²,)` in the order of `spherical_harmonics`; the
         unit sphere is $\theta_{00} = \sqrt{4\pi}$, all others 0.
 
+    Accuracy: round-off; in float32 points and normals within 1e-5
+        (`tests/test_design.py::test_single_precision`).
     Differentiable: forward and reverse in theta.
     Raises:
         TypeError: what is no discretisation, a degree that is no whole number.

@@ -202,6 +202,7 @@ def rigid_motion(
         theta: rotation, and shift `(d,)`. In space the rotation is a vector `(3,)` along the axis,
             as long as the angle; in the plane an angle `()`. Smooth everywhere, at 0 too.
 
+    Accuracy: round-off; in float32 within 1e-5 (`tests/test_design.py::test_single_precision`).
     Differentiable: forward and reverse in theta and x, to any order.
     Raises:
         ValueError: a rotation or shift of another shape.

@@ -120,7 +120,8 @@ def evolve(
     Returns:
         `Evolution`: `ts`, `clouds`, `surfaces`, `fields`, `history`.
 
-    Accuracy: in time that of the solver; in space that of the method (`tests/test_moving.py`).
+    Accuracy: in time that of the solver; in space that of the method; in float32 points are within
+        1e-5 (`tests/test_moving.py`).
     Differentiable: forward and reverse, under `jit`, with the neighbours that there were at t0,
         which must then serve until t1.
     Raises:

@@ -14,7 +14,7 @@ import pytest
 
 import jaxsurf as js
 
-from .tested import tables, tests_of
+from . import tested
 
 pytestmark = pytest.mark.slow
 
@@ -49,8 +49,10 @@ _EXACT = {
 def test_accuracy_in_single_precision_is_stated():
     """Of every function with a test of it, and of solvers and problems in time."""
     kinds = (js.AbstractEvolution, dfx.AbstractSolver)
-    rows = {name: row for table in tables().values() for name, row in table.items()}
-    public = {name: getattr(js, name) for name, row in rows.items() if tests_of(row["float32"])}
+    rows = {name: row for table in tested.tables().values() for name, row in table.items()}
+    public = {
+        name: getattr(js, name) for name, row in rows.items() if tested.tests_of(row["float32"])
+    }
     asked = {
         name: value.__doc__
         for name, value in public.items()

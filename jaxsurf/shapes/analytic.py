@@ -6,6 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxsurf.arguments import in_range, on_host, real, whole
 from jaxsurf.cloud import PointCloud
@@ -20,6 +21,8 @@ from jaxsurf.shapes.parametric import (
 )
 from jaxsurf.shapes.sampling import Project, relax
 from jaxsurf.shapes.spacing import ideal_spacing
+
+Axes = tuple[float, float, float] | Float[Array, " 3"]
 
 
 def circle(n: int, *, radius: float = 1.0) -> PointCloud:
@@ -65,7 +68,7 @@ def sphere(n: int, *, radius: float = 1.0) -> PointCloud:
     return sorted_cloud(radius * normals, normals)
 
 
-def ellipsoid(n: int, axes: tuple[float, float, float], *, steps: int = 30) -> PointCloud:
+def ellipsoid(n: int, axes: Axes, *, steps: int = 30) -> PointCloud:
     r"""n quasi-uniform points on the ellipsoid $x^2/a^2 + y^2/b^2 + z^2/c^2 = 1$.
 
     The Fibonacci lattice is carried over by a map that preserves area, then relaxed with
@@ -147,7 +150,7 @@ def sphere_projection(radius: float = 1.0) -> Project:
     return project
 
 
-def ellipsoid_projection(axes: tuple[float, float, float]) -> Project:
+def ellipsoid_projection(axes: Axes) -> Project:
     r"""Closest point on an ellipsoid, for `jitter` and `relax`.
 
     $x_i = a_i^2 y_i/(t + a_i^2)$ with t the largest root of
@@ -245,7 +248,7 @@ def _check_positive(name: str, value: Any) -> None:
     in_range(value, name)
 
 
-def _checked_axes(axes: tuple[float, float, float]) -> np.ndarray:
+def _checked_axes(axes: Axes) -> np.ndarray:
     semi = on_host(axes, "axes", (3,))
     raise_at(not_positive(semi), "axis {i} is {v}, expected a positive number", semi)
     in_range(semi, "axes")

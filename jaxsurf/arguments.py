@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .failures import check, is_concrete, needs_values, not_finite, raise_at, refuse
 
@@ -267,6 +267,13 @@ POINTS = (("n", 2), ("n", 3))
 def is_array(x: Any) -> bool:
     """True for an array or what stands for one while JAX traces; False for other leaves."""
     return isinstance(x, jax.Array | np.ndarray)
+
+
+def precision_of(*trees: PyTree) -> Any:
+    """The floating type that combines those of all arrays; that of numbers where there are none."""
+    kinds = [leaf.dtype for leaf in jax.tree.leaves(trees) if is_array(leaf)]
+    found = [kind for kind in kinds if jnp.issubdtype(kind, jnp.inexact)]
+    return jnp.result_type(*found) if found else jnp.result_type(float)
 
 
 def more_digits(dtype: Any) -> str:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from .adapt import dominance, first_slots, is_better, share_wanted, sizes_to_try
 from .adapt import residual_tolerance as residual_tolerance
-from .arguments import as_many, instance
+from .arguments import as_many, instance, whole
 from .arguments import mask as checked_mask
 from .cloud import PointCloud
 from .compiling import at_once, copying_jit, namespace, sized_jit
@@ -28,7 +28,7 @@ from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .neighbors import Neighbors, Rows, find_neighbors, nearest_of, switched_on
 from .stencils.dcpse import DCPSE
 from .stencils.gathers import take
-from .stencils.method import AbstractMethod, Diagnostics, Neighborhood
+from .stencils.method import AbstractMethod, Diagnostics, Neighborhood, weights_by
 from .stencils.stencil import Stencil
 from .stencils.targets import Laplacian
 
@@ -123,7 +123,8 @@ def stencil_weights(
     points but a rounded number of blocks, so that clouds of other sizes share it.
     """
     rows = np.arange(cloud.n, dtype=np.int32) if rows is None else rows
-    blocks = blocks_of(cloud, neighbors, rows, method.batch_size)
+    size = whole(method.batch_size, f"batch_size of {method}", least=1)
+    blocks = blocks_of(cloud, neighbors, rows, size)
     return rows_of(*_weights_of_blocks(blocks, method, target), len(rows))
 
 
@@ -148,7 +149,7 @@ def _slots_first(indices):
 
 @sized_jit
 def _weights_of_blocks(blocks, method, target):
-    return blockwise(lambda block: method.weights(neighborhood(block), target), blocks)
+    return blockwise(lambda block: weights_by(method, neighborhood(block), target), blocks)
 
 
 def neighborhood(block) -> Neighborhood:
@@ -180,7 +181,8 @@ def _adapted(cloud, method, throw, needed=True):
 def _chosen(cloud, method, throw, needed):
     on = cloud.host_active
     available = int(on.sum())
-    k = min(method.neighbor_count(cloud.dim), available)
+    count = whole(method.neighbor_count(cloud.dim), f"neighbor_count of {method}", least=1)
+    k = min(count, available)
     neighbors = find_neighbors(cloud, k, throw=throw)
     _check_sizes(cloud, neighbors, method, Laplacian(), throw)
     found = stencil_weights(cloud, neighbors, method, Laplacian())
@@ -265,7 +267,7 @@ def _dominance(weights, diagnostics) -> np.ndarray:
 
 def _check_sizes(cloud, neighbors, method, target, throw) -> None:
     as_many("neighbours", neighbors.n, "the cloud", cloud.n)
-    need = method.basis_size(cloud.dim, target)
+    need = whole(method.basis_size(cloud.dim, target), f"basis_size of {method}", least=1)
     if throw and neighbors.k < need:
         raise ValueError(f"k = {neighbors.k} neighbours, {method} needs at least {need}")
 

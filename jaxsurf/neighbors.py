@@ -40,8 +40,8 @@ class Neighbors(eqx.Module):
     Raises:
         TypeError: indices that are not integers, a mask that is not bool.
         ValueError: shapes that do not fit; an index that is no point, a slot 0 that is not the
-            point itself (both in compiled code too, when it runs); on concrete arrays a mask that
-            leaves nothing.
+            point itself, a mask that leaves nothing or others but not the point itself (all in
+            compiled code too, when it runs).
 
     Example:
         >>> neighbors = js.find_neighbors(js.sphere(300), k=12)
@@ -68,15 +68,12 @@ class Neighbors(eqx.Module):
         text = "slot 0 of row {i} names point {v}, expected {i}"
         indices = refuse(indices, first != np.arange(self.n), text, first)
         object.__setattr__(self, "indices", indices)  # with the errors of compiled code
-        if is_concrete(indices, self.mask):
-            used = np.asarray(self.mask)
-            if not used.any():
-                raise ValueError(f"mask is False in all {used.size} slots: no point has neighbours")
-            raise_at(
-                used.any(axis=1) & ~used[:, 0],
-                "mask of row {i} leaves out the point itself in slot 0 but takes {v} others",
-                used.sum(axis=1),
-            )
+        used = np.asarray(self.mask) if is_concrete(self.mask) else self.mask
+        text = f"mask is False in all {used.size} slots: no point has neighbours"
+        mask = refuse(self.mask, ~used.any(), text)
+        text = "mask of row {i} leaves out the point itself in slot 0 but takes {v} others"
+        mask = refuse(mask, used.any(axis=1) & ~used[:, 0], text, used.sum(axis=1))
+        object.__setattr__(self, "mask", mask)
         radius = self.radius
         if radius is not None and is_array(radius):
             shaped(radius, "radius", (), (self.n,))

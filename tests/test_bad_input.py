@@ -152,3 +152,13 @@ def test_traced_indices_that_are_no_points(bad, text):
     known = eqx.filter_jit(lambda n, c: js.laplace_beltrami(c, n, throw=False)(given))
     assert "callback" in apply.lower(wrong).as_text()
     assert "callback" not in known.lower(found, cloud).as_text()
+
+
+def test_traced_masks_that_leave_nothing():
+    found = js.find_neighbors(SPHERE, k=6)
+    counted = eqx.filter_jit(lambda mask: js.Neighbors(found.indices, mask).mask.sum())
+    assert counted(found.mask) == 1800
+    with pytest.raises(eqx.EquinoxRuntimeError, match="mask is False in all 1800 slots"):
+        counted(jnp.zeros_like(found.mask))
+    with pytest.raises(eqx.EquinoxRuntimeError, match="leaves out the point itself"):
+        counted(found.mask.at[5, 0].set(False))

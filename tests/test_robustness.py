@@ -14,6 +14,7 @@ import pytest
 import jaxsurf as js
 
 from .helpers import jittered_sphere, random_sphere
+from .test_meshes import ball_mesh
 
 N = 300
 ORDER = np.random.default_rng(7).permutation(N)
@@ -262,6 +263,25 @@ def test_neighbors(cloud, method):
     np.testing.assert_array_equal(plain[ORDER][:, ORDER], others[2])
 
 
+@pytest.mark.parametrize("cloud", CLOUDS)
+def test_search_on_the_device(cloud):
+    """No two points of these are as far apart as the radius."""
+
+    def found(which):
+        points = variant(cloud, which).points
+        capacity = js.allocate_search(points, 0.25)
+        lists = js.search_neighbors(points, radius=0.25, capacity=capacity)[0]
+        near = np.zeros((N, N), bool)
+        np.add.at(near, (np.nonzero(lists.mask)[0], lists.indices[lists.mask]), True)
+        return near
+
+    plain, *others = map(found, ("plain", *OTHERS))
+    assert plain.sum() > 3 * N
+    for other in others[:2]:
+        np.testing.assert_array_equal(plain, other)
+    np.testing.assert_array_equal(plain[ORDER][:, ORDER], others[2])
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_sampling(seed):
     """The same points of level sets and Poisson disks, in the same order."""
@@ -276,3 +296,7 @@ def test_sampling(seed):
     candidates = np.asarray(random_sphere(2_000).points)
     chosen = [js.poisson_disk(a, 0.3) for a in (candidates, candidates * shift)]
     np.testing.assert_array_equal(*chosen)
+    mesh = ball_mesh(300, axes=(1, 0.8, 0.6))
+    shifted = js.TriangleMesh(mesh.vertices * shift, mesh.triangles)
+    clouds = [js.sample_mesh(part, n=200) for part in (mesh, shifted)]
+    np.testing.assert_allclose(*(cloud.points for cloud in clouds), atol=1e-9)

@@ -138,7 +138,8 @@ def evolve(
         >>> cloud = js.sphere(500)
         >>> heat = lambda surface: js.AdvectionDiffusionReaction(surface.laplacian)
         >>> u0 = cloud.points[:, 0] * cloud.points[:, 1]
-        >>> solution = js.evolve(js.Motion(velocity), cloud, t1=1.0, fields=u0, problem=heat)
+        >>> given = dict(fields=u0, problem=heat, method=js.GFDM(degree=4))
+        >>> solution = js.evolve(js.Motion(velocity), cloud, t1=1.0, **given)
         >>> exact = 1.5**-2 * jnp.exp(-12 * (1 - 1 / 1.5)) * u0
         >>> bool(jnp.abs(solution.fields[-1] - exact).max() < 1e-2 * exact.max())
         True

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import count_on, instance, real, switched_off, whole
+from ..arguments import count_on, instance, precision_of, real, switched_off, whole
 from ..boundary import Closure, check_border
 from ..failures import is_concrete
 from ..stencils.algebra import AbstractOperator, check_scalar
@@ -219,8 +219,7 @@ def _reference(system: _System, k: int) -> Float[Array, "n K"]:
     way derivatives converge fast.
     """
     n = system.operator.n
-    kinds = [a.dtype for a in jax.tree.leaves(eqx.filter(system, eqx.is_inexact_array))]
-    noise = _noise(n, min(k + 8 + 2 * math.isqrt(k), n), jnp.result_type(*kinds))
+    noise = _noise(n, min(k + 8 + 2 * math.isqrt(k), n), precision_of(system))
     on = system.operator.active
     # As without those that are switched off.
     return noise if on is None else noise[jnp.maximum(jnp.cumsum(on) - 1, 0)]

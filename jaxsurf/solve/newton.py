@@ -13,7 +13,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ..arguments import as_float, finite, more_digits, switched_off, whole
+from ..arguments import as_float, finite, more_digits, precision_of, switched_off, whole
 from ..boundary import Closure
 from ..compiling import sized_jit
 from ..failures import is_concrete, refuse
@@ -100,7 +100,7 @@ def solve_nonlinear(
     whole(max_steps, "max_steps", least=1)
     u0 = as_float(u0, "u0", (operator.n,))
     rhs = as_float(rhs, "right-hand side", (), u0.shape)
-    u0 = u0.astype(jnp.result_type(u0, *jax.tree.leaves(operator), jnp.float32))
+    u0 = u0.astype(jnp.promote_types(precision_of(u0, operator), jnp.float32))
     rhs, rtol = rhs.astype(u0.dtype), tolerance(rtol, u0.dtype)
     u0 = switched_off(operator.active, u0)
     if rhs.ndim:

@@ -8,10 +8,11 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..arguments import as_float, count_on, finite, more_digits, switched_off, whole
+from ..arguments import as_float, count_on, finite, more_digits, precision_of, switched_off, whole
 from ..boundary import Closure
 from ..compiling import at_once, sized_jit
 from ..failures import is_concrete, needs_values, refuse, without_derivatives
+from ..functions import constant
 from ..solutions import told
 from ..stencils.algebra import AbstractOperator
 from ..stencils.stencil import prepared
@@ -105,7 +106,7 @@ def solve(
     """
     check_system(operator, closure, preconditioner, solver, atol)
     rhs = as_float(rhs, "right-hand side", (operator.n,), (operator.n, "c"))
-    rhs = rhs.astype(jnp.result_type(rhs, *jax.tree.leaves(operator), jnp.float32))
+    rhs = rhs.astype(jnp.promote_types(precision_of(rhs, operator), jnp.float32))
     rhs = switched_off(operator.active, rhs)
     _check(operator, rhs, closure)
     # What was not asked for may end at round-off.
@@ -142,7 +143,7 @@ def _solve_one(rhs, operator, closure, preconditioner, solver, limits, mean_zero
     system = System.of(operator, closure, rhs.dtype, mean_zero)
     offset = jnp.zeros_like(rhs) if closure is None else closure.offset()
     known = rhs if closure is None else system.restriction(rhs - operator(offset))
-    inverse = jax.lax.stop_gradient(system.inverse(preconditioner))
+    inverse = constant(system.inverse(preconditioner))
     found = solve_system(system.matrix, known, solver, inverse)
     v = found.value
     u = v if closure is None else closure.homogeneous(v) + offset
@@ -150,7 +151,7 @@ def _solve_one(rhs, operator, closure, preconditioner, solver, limits, mean_zero
         u = u - jnp.sum(u) / count_on(operator.active, operator.n)
         u = switched_off(operator.active, u)
     # Judged at size one, as squares of 1e-300 are zero; and whatever the solver says, by residuals.
-    fixed, b, v = jax.lax.stop_gradient((system, known, v))
+    fixed, b, v = constant((system, known, v))
     scale = scale_of(b)
     b, v = b / scale, v / scale
     signs = 1.0 - 2.0 * (jnp.arange(operator.n) % 2).astype(v.dtype)

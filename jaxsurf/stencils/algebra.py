@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import functools
 import math
 from collections.abc import Callable
 
@@ -38,6 +39,12 @@ class AbstractOperator(eqx.Module):
 
     # NumPy's arrays leave products with operators to these.
     __array_ufunc__ = None
+
+    def __init_subclass__(cls, **kwargs):
+        """Operators of users' own are held to the shapes that they promise."""
+        super().__init_subclass__(**kwargs)
+        if "__call__" in vars(cls):
+            cls.__call__ = _as_promised(cls.__call__)  # type: ignore[method-assign]
 
     @property
     @abc.abstractmethod
@@ -90,7 +97,10 @@ class AbstractOperator(eqx.Module):
         Raises:
             ValueError: an operator of which it is not known.
         """
-        raise ValueError(f"the diagonal of a {type(self).__name__} is not at hand")
+        raise ValueError(
+            f"the diagonal of a {type(self).__name__} is not at hand: an operator of one's own "
+            "has it as its property diagonal"
+        )
 
     def to_scipy(self) -> scipy.sparse.csr_matrix:
         """CSR matrix acting on flattened fields (the components of a point stand together).
@@ -98,7 +108,10 @@ class AbstractOperator(eqx.Module):
         Raises:
             ValueError: an operator of which only products are known.
         """
-        raise ValueError(f"the matrix of a {type(self).__name__} is not at hand")
+        raise ValueError(
+            f"the matrix of a {type(self).__name__} is not at hand: an operator of one's own "
+            "returns it from its method to_scipy"
+        )
 
     def to_lineax(self, dtype=None) -> lx.AbstractLinearOperator:
         """The operator on one field, for the linear solvers of lineax."""
@@ -158,6 +171,20 @@ class AbstractOperator(eqx.Module):
         parts = [repr(part) for part in vars(self).values() if isinstance(part, AbstractOperator)]
         of = f", of {' and '.join(parts)}" if parts else ""
         return f"{type(self).__name__}({self._maps}{of})"
+
+
+def _as_promised(call: Callable) -> Callable:
+    @functools.wraps(call)
+    def checked(self, u):
+        result = call(self, u)
+        batch = np.shape(u)[1 : np.ndim(u) - len(self.in_shape)]
+        want = (self.n, *batch, *self.out_shape)
+        if not isinstance(result, jax.Array | np.ndarray) or result.shape != want:
+            have = f"shape {result.shape}" if hasattr(result, "shape") else repr(result)
+            raise ValueError(f"{type(self).__name__} gives {have}, expected shape {want}")
+        return result
+
+    return checked
 
 
 class Diagonal(AbstractOperator):

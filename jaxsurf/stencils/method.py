@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..arguments import real, whole
+from ..arguments import as_float, real, whole
 from ..fits.monomials import polynomial_count
 from ..fits.plane import Neighborhood, dot
 from .targets import AbstractTarget
@@ -102,6 +102,25 @@ class AbstractMethod(eqx.Module):
     @abc.abstractmethod
     def batch_size(self) -> int:
         """How many stencils are computed at once: enough to be fast, few enough for the cache."""
+
+
+def weights_by(
+    method: AbstractMethod, around: Neighborhood, target: AbstractTarget
+) -> tuple[Float[Array, "... k *p"], Diagnostics]:
+    """Those of a method, which may be a user's own, if they are what they have to be.
+
+    Raises:
+        TypeError, ValueError: they are not.
+    """
+    name, want = f"weights of {type(method).__name__}", around.mask.shape
+    found = method.weights(around, target)
+    if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Diagnostics)):
+        kinds = type(found).__name__
+        raise TypeError(f"{name} returns a {kinds}, expected an array and Diagnostics")
+    values = as_float(found[0], name)
+    if values.shape[values.ndim - len(want) :] != want:
+        raise ValueError(f"{name} has shape {values.shape}, expected (*components, {str(want)[1:]}")
+    return values, found[1]
 
 
 def check_positive(method: AbstractMethod, **least: bool) -> None:

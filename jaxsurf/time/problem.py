@@ -148,20 +148,34 @@ class AbstractEvolution(eqx.Module):
         """The whole right-hand side, for explicit and for fully implicit solvers."""
         u = self.closed(t, u)
         now = self.at(t, u)
-        return now._free(added(now.linear(t, u), now.rest(t, u, args)))
+        return now._free(added(now._linear(t, u), now._rest(t, u, args)))
 
     def implicit_rate(self, t, u: PyTree[Array], args) -> PyTree[Array]:
         """The part for implicit steps, linear in u: P L E u."""
         within = jax.tree.map(lambda v: homogeneous(self.closure, v), u)
-        return self._free(self.linear(t, within))
+        return self._free(self._linear(t, within))
 
     def explicit_rate(self, t, u: PyTree[Array], args) -> PyTree[Array]:
         """The part for explicit steps: P (R(E u + e) + L e)."""
-        rest = self.rest(t, self.closed(t, u), args)
+        rest = self._rest(t, self.closed(t, u), args)
         if self.closure is None:
             return self._free(rest)
         none = self.closed(t, jax.tree.map(jnp.zeros_like, u))
-        return self._free(added(rest, self.linear(t, none)))
+        return self._free(added(rest, self._linear(t, none)))
+
+    def _linear(self, t, u):
+        return self._like(u, self.linear(t, u), "linear")
+
+    def _rest(self, t, u, args):
+        return self._like(u, self.rest(t, u, args), "rest")
+
+    def _like(self, u: PyTree[Array], value: PyTree[Array], name: str) -> PyTree[Array]:
+        """A part of the rate, as it has to be, of problems of users' own as well."""
+        name = f"{name} of {type(self).__name__}"
+        have, want = (str(jax.tree.structure(tree)) for tree in (value, u))
+        if have != want:
+            raise ValueError(f"{name} returns a {have}, the state is a {want}")
+        return jax.tree.map(lambda v, y: same_shape(v, y, name), value, u)
 
     def _free(self, rate: PyTree[Array]) -> PyTree[Array]:
         rate = only_on(self.active, rate)

@@ -1,0 +1,130 @@
+"""Classes of users' own that do not do what their abstract class promises."""
+
+# A row a case.
+# ruff: noqa: E501
+
+import functools
+
+import equinox as eqx
+import jax.numpy as jnp
+
+import jaxsurf as js
+
+from ..helpers import ring
+from . import Case
+
+N = 12
+
+
+@functools.cache
+def parts():
+    return ring(N)
+
+
+def u0():
+    return jnp.cos(parts()[0])
+
+
+class Operator(js.AbstractOperator):
+    how: object = eqx.field(static=True)
+    n = N
+    in_shape = ()
+    out_shape = ()
+
+    def __call__(self, u):
+        return self.how(u)
+
+
+class Preconditioner(js.AbstractPreconditioner):
+    how: object = eqx.field(static=True)
+    n = N
+
+    def __call__(self, r):
+        return self.how(r)
+
+
+class Problem(js.AbstractEvolution):
+    closure: None
+    first: object = eqx.field(static=True)
+    second: object = eqx.field(static=True)
+
+    def linear(self, t, u):
+        return self.first(u)
+
+    def rest(self, t, u, args):
+        return self.second(u)
+
+
+class Method(js.AbstractMethod):
+    """That of GFDM, with something else."""
+
+    change: object = eqx.field(static=True, default=lambda found: found)
+    counts: tuple = eqx.field(static=True, default=(7, 3, 64))
+
+    def neighbor_count(self, dim):
+        return self.counts[0]
+
+    def basis_size(self, dim, target):
+        return self.counts[1]
+
+    @property
+    def batch_size(self):
+        return self.counts[2]
+
+    def weights(self, neighborhood, target):
+        return self.change(js.GFDM(degree=2).weights(neighborhood, target))
+
+
+def solved(how):
+    operator = 1 - parts()[1]
+    return js.solve(operator, u0(), preconditioner=Preconditioner(False, how))
+
+
+def integrated(first=lambda u: parts()[1](u), second=jnp.zeros_like):
+    return js.integrate(Problem(None, first, second), u0(), t1=0.1)
+
+
+def built(**settings):
+    return js.laplace_beltrami(js.circle(N), method=Method(**settings))
+
+
+WRONG = {
+    "one entry less": (lambda u: u[:-1], (f"({N - 1},)", f"({N},)")),
+    "a column": (lambda u: u[:, None], (f"({N}, 1)", f"({N},)")),
+    "a number": (lambda u: 1.0, (f"({N},)",)),
+    "None": (lambda u: None, ("None",)),
+}
+SHAPES = {label: row for label, row in WRONG.items() if label not in ("a number", "None")}
+CASES = [
+    *(
+        Case("AbstractOperator", f"gives {label}", lambda how=how: Operator(how) @ u0(), ("Operator", *words, f"({N},)"))
+        for label, (how, words) in WRONG.items()
+    ),
+    *(
+        Case("AbstractOperator", f"gives {label} in a sum", lambda how=how: (Operator(how) - 1)(u0()), ("Operator", *words))
+        for label, (how, words) in WRONG.items()
+    ),
+    Case("AbstractOperator", "no matrix to solve by", lambda: js.solve(Operator(lambda u: u), u0()), ("matrix", "Operator", "to_scipy")),
+    Case("AbstractOperator", "no matrix for modes", lambda: js.eigenmodes(Operator(lambda u: u), 2), ("matrix", "Operator", "to_scipy")),
+    Case("AbstractOperator", "no diagonal", lambda: js.jacobi(Operator(lambda u: u)), ("diagonal", "Operator")),
+    *(
+        Case("AbstractPreconditioner", f"gives {label}", lambda how=how: solved(how), ("Preconditioner", *words))
+        for label, (how, words) in WRONG.items()
+    ),
+    *(
+        Case("AbstractEvolution", f"linear gives {label}", lambda how=how: integrated(first=how), ("linear of Problem", *words))
+        for label, (how, words) in SHAPES.items()
+    ),
+    *(
+        Case("AbstractEvolution", f"rest gives {label}", lambda how=how: integrated(second=how), ("rest of Problem", *words))
+        for label, (how, words) in SHAPES.items()
+    ),
+    Case("AbstractEvolution", "rest gives None", lambda: integrated(second=lambda u: None), ("rest of Problem", "None")),
+    Case("AbstractEvolution", "linear gives a number", lambda: integrated(first=lambda u: 0.0), ("linear of Problem", "()", f"({N},)")),
+    Case("AbstractEvolution", "linear gives two", lambda: integrated(first=lambda u: (u, u)), ("linear of Problem", "(*, *)")),
+    Case("AbstractMethod", "weights of too few slots", lambda: built(change=lambda found: (found[0][..., 1:, :], found[1])), ("weights of Method", "(6, 64)", "7, 64")),
+    Case("AbstractMethod", "weights without diagnostics", lambda: built(change=lambda found: found[0]), ("weights of Method", "Diagnostics")),
+    Case("AbstractMethod", "no neighbours", lambda: built(counts=(0, 3, 64)), ("neighbor_count", "0", "1")),
+    Case("AbstractMethod", "half a polynomial", lambda: built(counts=(7, 2.5, 64)), ("basis_size", "2.5")),
+    Case("AbstractMethod", "empty blocks", lambda: built(counts=(7, 3, 0)), ("batch_size", "0", "1")),
+]  # fmt: skip

@@ -104,7 +104,7 @@ def check(values: Any, bad: Callable, message: str, *others: Any, **how: Any) ->
         raise_at(bad(*known), message, known[0], **how)
 
 
-def refuse(x: Any, bad: Array, message: str, values: Any = None, **how: Any) -> Any:
+def refuse(x: Any, bad: Any, message: str, values: Any = None, **how: Any) -> Any:
     """The array, but an error where there is anything bad: now, or when a compiled program runs.
 
     Args:

@@ -1,9 +1,14 @@
-"""Which size of neighbourhood serves a point: one decision, on the host and in compiled code."""
+r"""Which neighbourhood serves a point: one decision, on the host and in compiled code.
+
+Lists keep the usual number of neighbours: a larger neighbourhood is represented by points that are
+spread evenly over it. So no row is wider than others.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -12,15 +17,18 @@ from .compiling import namespace
 from .stencils.method import AbstractMethod
 from .stencils.targets import Laplacian
 
-# Sizes of the neighbourhoods of such points, in units of the usual one: tried in turn.
+# How many of the nearest points make up the neighbourhoods of such points, in units of the usual
+# number: tried in turn.
 _SIZES = (1.5, 2.25, 3.4, 0.67, 0.45)
+# A direction along which no regular arrangement of points is symmetric.
+_OBLIQUE = (0.6180, 0.3247, 0.7549)
 
 # Of NumPy or of JAX.
 _Numbers = Float[Array, " r"] | Float[np.ndarray, " r"]
 
 
 def sizes_to_try(method: AbstractMethod, dim: int, k: int, available: int) -> list[int]:
-    """Numbers of neighbours beside the usual k; none where no larger ones can be had."""
+    """Of how many of the nearest, beside the usual k; none where no larger ones can be had."""
     need = method.basis_size(dim, Laplacian())
     sizes = [min(int(k * size), available) for size in _SIZES if k * size > 1.5 * need]
     return sizes if max(sizes, default=0) > k else []
@@ -58,9 +66,51 @@ def is_better(
     return (best < method.least_dominance) & (share > best) & (share >= wanted)
 
 
-def first_slots(count: Any, mask) -> Bool[Array, "*r k"] | Bool[np.ndarray, "*r k"]:
-    """The first slots of lists, as many as are counted for each row or for all."""
-    return namespace(mask).arange(mask.shape[1]) < count
+def represented(points, indices, mask, size, k: int) -> tuple[Any, Any]:
+    """Lists of k slots for the nearest `size` points: all of these, or k spread evenly over them.
+
+    Args:
+        points: `(n, d)`, of NumPy or of JAX as the lists are.
+        indices, mask: lists of many points, `(r, K)`, nearest first.
+        size: how many of them count, one number or `(r, 1)`; may be traced.
+
+    Returns:
+        Indices and mask `(r, k)`, nearest first.
+    """
+    xp = namespace(mask)
+    mask = mask & (xp.arange(mask.shape[1]) < size)
+    offsets = points[indices] - points[indices[:, :1]]
+    chosen = xp.where(xp.asarray(size) > k, _spread(xp, offsets, mask, k), mask)
+    slots = xp.argsort(~chosen, axis=1, **({"kind": "stable"} if xp is np else {}))[:, :k]
+    held = xp.take_along_axis(chosen, slots, axis=1)
+    found = xp.take_along_axis(indices, slots, axis=1)
+    return xp.where(held, found, indices[:, :1]), held
+
+
+def _spread(xp, offsets, mask, k: int):
+    """True for k of the points, each in turn the one farthest from those before; the first first.
+
+    Of points as far as each other, to round-off, that farther along some direction.
+    """
+    size = xp.max(xp.where(mask[..., None], xp.abs(offsets), 0), axis=(1, 2), keepdims=True)
+    x = offsets / xp.where(size > 0, size, 1)
+    along = x @ xp.asarray(_OBLIQUE[: x.shape[-1]], x.dtype)
+    favour = 1 + float(jnp.finfo(x.dtype).eps) ** 0.5 * along
+
+    def farther(_, state):
+        chosen, gap = state
+        far = xp.argmax(xp.where(mask, gap * favour, -1), axis=1)[:, None]
+        to = x - xp.take_along_axis(x, far[..., None], axis=1)
+        gap = xp.minimum(gap, xp.sum(to * to, axis=-1))
+        return chosen | ((xp.arange(mask.shape[1]) == far) & mask), gap
+
+    first = mask & (xp.arange(mask.shape[1]) == 0)
+    state = first, xp.sum(x * x, axis=-1)
+    if xp is jnp:
+        return jax.lax.fori_loop(1, k, farther, state)[0]
+    for i in range(1, k):
+        state = farther(i, state)
+    return state[0]
 
 
 def residual_tolerance(dtype) -> float:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .adapt import dominance, first_slots, is_better, share_wanted, sizes_to_try
+from .adapt import dominance, is_better, represented, share_wanted, sizes_to_try
 from .adapt import residual_tolerance as residual_tolerance
 from .arguments import as_many, instance, whole
 from .arguments import mask as checked_mask
@@ -45,11 +45,12 @@ def choose_neighbors(
 ) -> Neighbors:
     r"""Neighbourhoods suited to a method, of another size where the points are irregular.
 
-    Every point gets the number of neighbours that the method asks for. Where the
+    Every point gets the number k of neighbours that the method asks for. Where the
     Laplacian's weight of the centre is then positive or small,
     $-w_{ii} < 0.2 \sum_{j \ne i} |w_{ij}|$ (with RBF-FD only where it is positive), or its
-    conditions cannot be met, larger neighbourhoods are tried, by half, up to three times, then
-    smaller ones, which see less of a fold. The first that serves is taken; if none does, that with
+    conditions cannot be met, larger neighbourhoods are tried, by half, up to three times, of which
+    k points that are spread evenly over them are taken; then smaller ones, which see less of a
+    fold. The first that serves is taken; if none does, that with
     the most dominant centre, on a border the usual one: a one-sided Laplacian has no dominant
     centre, however large. Such points are what gives collocation matrices eigenvalues with
     positive real part (`experiments`, stability study).
@@ -62,7 +63,7 @@ def choose_neighbors(
         throw: passed on to `find_neighbors`.
 
     Returns:
-        Neighbour lists; rows shorter than the longest are padded. Where no size serves a point
+        Neighbour lists with k slots; shorter rows are padded. Where no size serves a point
         inside the surface, a warning says how many and names the worst.
 
     Raises:
@@ -196,42 +197,31 @@ def _chosen(cloud, method, throw, needed):
 
     # Filled up with copies, so that few shapes are ever compiled.
     rows = np.resize(poor, -(-poor.size // _CHUNK) * _CHUNK)
-    indices, mask = nearest_of(cloud, rows, max(sizes))
-    chosen, best = np.full(rows.size, k), share[rows]
-    kept = [_wider(np.asarray(a)[..., rows], max(sizes)) for a in jax.tree.leaves(found)]
+    wide = nearest_of(cloud, rows, max(sizes))
+    points, chosen, best = np.asarray(cloud.points), np.full(rows.size, k), share[rows]
+    lists = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
+    # Rows last, as weights and diagnostics have them.
+    kept = [np.asarray(a)[..., rows] for a in (lists[0].T, lists[1].T, *jax.tree.leaves(found))]
     wanted = share_wanted(border, share, method)[rows]
     for size in sizes:
-        trial = _in_chunks(cloud, indices, mask & first_slots(size, mask), method, rows)
+        some = represented(points, *wide, size, k)
+        trial = _in_chunks(cloud, *some, method, rows)
         now = _dominance(*trial)
         better = is_better(now, best, wanted, method)
         best = np.where(better, now, best)
         chosen = np.where(better, size, chosen)
-        kept = [np.where(better, new, old) for new, old in zip(jax.tree.leaves(trial), kept)]
+        news = some[0].T, some[1].T, *jax.tree.leaves(trial)
+        kept = [np.where(better, new, old) for new, old in zip(news, kept)]
     _report(poor, best[: poor.size], border, chosen, method)
 
-    widest = int(max(k, chosen.max()))
-    own = np.tile(np.arange(cloud.n, dtype=np.int32)[:, None], widest - k)
-    all_indices = np.concatenate([np.asarray(neighbors.indices), own], axis=1)
-    all_mask = np.pad(np.asarray(neighbors.mask), ((0, 0), (0, widest - k)))
-    changed = chosen != k
-    where = rows[changed]
-    all_mask[where] = (mask & first_slots(chosen[:, None], mask))[changed, :widest]
-    all_indices[where] = np.where(all_mask[where], indices[changed, :widest], where[:, None])
-
     def put(old, new):
-        full = np.array(_wider(old, widest))
-        full[..., where] = (new[:widest] if new.ndim > 1 else new)[..., changed]
+        full = np.array(old)
+        full[..., rows] = new
         return jnp.asarray(full)
 
-    leaves = [put(old, new) for old, new in zip(jax.tree.leaves(found), kept)]
-    chosen_weights = jax.tree.unflatten(jax.tree.structure(found), leaves)
-    return Neighbors(jnp.asarray(all_indices), jnp.asarray(all_mask)), chosen_weights
-
-
-def _wider(values, width: int) -> np.ndarray:
-    """Weights with more slots; diagnostics, which have none, as they are."""
-    values = np.asarray(values)
-    return values if values.ndim == 1 else np.pad(values, ((0, width - len(values)), (0, 0)))
+    olds = lists[0].T, lists[1].T, *jax.tree.leaves(found)
+    indices, mask, *leaves = map(put, olds, kept)
+    return Neighbors(indices.T, mask.T), jax.tree.unflatten(jax.tree.structure(found), leaves)
 
 
 def _in_chunks(cloud, indices, mask, method, rows):
@@ -251,8 +241,8 @@ def _report(poor, best, border, chosen, method) -> None:
         worst = np.flatnonzero(failed)[np.argmin(best[failed])]
         warnings.warn(
             f"no neighbourhood of {failed.sum()} points serves {method}: the worst is point "
-            f"{poor[worst]}, where the centre has a share of {best[worst]:.2g} of the weights of "
-            f"{chosen[worst]} neighbours, {method.least_dominance} is needed; the operator "
+            f"{poor[worst]}, where the centre has a share of {best[worst]:.2g} of the weights "
+            f"among the {chosen[worst]} nearest, {method.least_dominance} is needed; the operator "
             "may have growing modes (js.spectral_estimate)",
             stacklevel=4,
         )

@@ -219,21 +219,19 @@ class Discretization(eqx.Module):
 
     # --- motion ----------------------------------------------------------------------------
 
-    def search(self, *, margin: float = 1.25, slots: int | None = None) -> NeighborSearch:
+    def search(self, *, margin: float = 1.25) -> NeighborSearch:
         """Room to find neighbours in while the surface moves, for `moved`; concrete surfaces only.
 
         Args:
             margin: factor on what these points need. Where points crowd, or where the neighbours
                 that a point had are spread, more is needed; a code says where it is not enough.
-            slots: of the new lists, which bound the neighbourhoods that points are given; as many
-                as the lists of this surface have if None. All operators are as wide.
 
         Raises:
-            TypeError: a margin that is no number, slots that are not a whole number.
-            ValueError: a margin below 1, fewer slots than the method asks for; a traced surface.
+            TypeError: a margin that is no number.
+            ValueError: a margin below 1; a traced surface.
         """
         needs_values("the surface", self)
-        return NeighborSearch.allocated(self.cloud, self.neighbors, self.method, margin, slots)
+        return NeighborSearch.allocated(self.cloud, self.neighbors, self.method, margin)
 
     def moved(
         self,

@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .adapt import dominance, first_slots, is_better, share_wanted, sizes_to_try
-from .arguments import instance, real, whole
+from .adapt import dominance, is_better, represented, share_wanted, sizes_to_try
+from .arguments import instance, real
 from .build import stencil_weights
 from .cells import all_on, distance_key
 from .checks import DETOUR, LINK, RINGS, ring_size
@@ -61,8 +61,8 @@ class NeighborSearch(eqx.Module):
     Args:
         method: how weights are computed; it asks for so many neighbours.
         k: the usual number of neighbours.
-        sizes: other numbers, tried in turn where the Laplacian has no dominant centre.
-        slots: of the lists; larger neighbourhoods have no room.
+        sizes: of other neighbourhoods, tried in turn where the Laplacian has no dominant centre.
+        slots: of the lists.
         tiers: the searches for all rows, for those with points out of reach or on another sheet,
             and for those that are adapted.
 
@@ -95,13 +95,11 @@ class NeighborSearch(eqx.Module):
         neighbors: Neighbors,
         method: AbstractMethod,
         margin: float,
-        slots: int | None,
     ) -> NeighborSearch:
         """With room for what these points need, times a margin."""
         real(margin, "margin", least=1)
         d, available = cloud.dim, int(cloud.host_active.sum())
         k = min(method.neighbor_count(d), available)
-        slots = max(k, neighbors.k) if slots is None else whole(slots, "slots", least=k)
         sizes = tuple(sizes_to_try(method, d, k, available))
         usual = min(max(k, 2 * RINGS), available)
         grid = _grid(cloud, _reach(cloud, neighbors, k, usual))
@@ -115,7 +113,13 @@ class NeighborSearch(eqx.Module):
 
         most = 2 * max(k, *sizes) if sizes else usual
         first = Tier(usual, 1, tier(0, 1).candidates)
-        return cls(method, k, sizes, slots, (first, tier(max(2 * k, usual), 2), tier(most, 2)))
+        return cls(
+            method,
+            k,
+            sizes,
+            max(k, neighbors.k),
+            (first, tier(max(2 * k, usual), 2), tier(most, 2)),
+        )
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -233,9 +237,12 @@ def _adapted(search, grid, rings, cloud, lists, laplacian):
     def look(rows, _):
         wide = _lists(grid, rings, rows, most, search.tiers[2])
 
+        def of_size(size):
+            return represented(cloud.points, wide.indices.T, wide.mask.T, size, search.k)
+
         def trial(best_so_far, size):
             best, chosen = best_so_far
-            some = Rows(wide.indices.T, wide.mask.T & first_slots(size, wide.mask.T))
+            some = Rows(*of_size(size))
             weights, diagnostics = stencil_weights(cloud, some, search.method, Laplacian(), rows)
             now = dominance(weights, diagnostics.residual)
             better = is_better(now, best, wanted[rows], search.method)
@@ -244,13 +251,11 @@ def _adapted(search, grid, rings, cloud, lists, laplacian):
         start = (share[rows], jnp.full(len(rows), search.k))
         chosen = jax.lax.scan(trial, start, jnp.array(search.sizes))[0][1]
         chosen = jnp.where(wide.code == 0, chosen, search.k)
-        code = jnp.where(chosen > search.slots, CROWDED, wide.code)
-        held = wide.mask & first_slots(chosen[:, None], wide.mask.T).T
-        indices = _wide(jnp.where(held, wide.indices, rows), search.slots, rows)
-        mask = _wide(held, search.slots, False)
-        changed = (chosen != search.k) & (code == 0)
-        indices = jnp.where(changed, indices, lists.indices[:, rows])
-        return _Lists(indices, jnp.where(changed, mask, lists.mask[:, rows]), code), changed
+        changed = (chosen != search.k) & (wide.code == 0)
+        new = of_size(chosen[:, None])
+        old = lists.indices[:, rows], lists.mask[:, rows]
+        indices, mask = (jnp.where(changed, a.T, b) for a, b in zip(new, old))
+        return _Lists(indices, mask, wide.code), changed
 
     poor = grid.on & (lists.code == 0) & (share < search.method.least_dominance)
     lists, changed = _for_rows(poor, look, (lists, jnp.zeros(cloud.n, bool)))

@@ -43,7 +43,6 @@ CALLS = [
     ("Discretization", "moved with long normals", lambda: surface().moved(x(), 2 * x()), ("normal 0", "2")),
     ("Discretization", "a search that is a number", lambda: surface().moved(x(), search=36), ("search", "36", "NeighborSearch")),
     ("Discretization", "a margin below one", lambda: surface().search(margin=0.5), ("margin", "0.5", "1")),
-    ("Discretization", "fewer slots than neighbours", lambda: surface().search(slots=20), ("slots", "20", "36")),
     ("NeighborSearch", "a method as text", lambda: js.NeighborSearch("gfdm", 36, (), 36, ()), ("method", "gfdm")),
     ("NeighborSearch", "fewer slots than neighbours", lambda: js.NeighborSearch(METHOD, 36, (), 20, ()), ("slots", "20", "36")),
     ("NeighborSearch", "one tier", lambda: js.NeighborSearch(METHOD, 36, (), 36, ((36, 1, 64),)), ("tiers", "1", "3")),

@@ -28,7 +28,7 @@ def gaps(points, indices):
 
 @pytest.mark.parametrize("cloud", [random_sphere(N), lattice()], ids=["random", "lattice"])
 def test_spread_over_the_neighbourhood(cloud):
-    """Farther apart than the nearest K (on a lattice by sqrt 2), nearest first, as on the device."""
+    """Farther apart than the nearest (on a lattice by sqrt 2), nearest first, as on the device."""
     points, indices, mask = lists(cloud)
     chosen, held = represented(points, indices, mask, WIDE, K)
     assert (

@@ -26,6 +26,10 @@ def scaled(x, axes):
     return axes * x
 
 
+def stretched(x, logs):
+    return jnp.exp(logs) * x
+
+
 def rippled(x, size):
     return x + size * jnp.sin(3 * x)
 
@@ -47,8 +51,8 @@ def axes_found(optimizer, start=(1.3, 1.0, 0.8), volume=4 * np.pi / 3, **options
     """Least area at fixed volume among ellipsoids."""
     return js.optimize_shape(
         area,
-        js.MappedShape(scaled, ball()),
-        jnp.asarray(start),
+        js.MappedShape(stretched, ball()),
+        jnp.log(jnp.asarray(start)),
         optimizer=optimizer,
         equalities={"volume": volume_left},
         args=(jnp.asarray(volume),),
@@ -62,7 +66,7 @@ def test_least_area_at_fixed_volume_is_a_ball_and_compiles_no_step():
     with count_compilations() as names:
         found = axes_found(LBFGS, callback=lambda now: seen.append((len(names), now)))
     assert found.converged and found.stopped == "converged"
-    np.testing.assert_allclose(found.theta, 1, atol=2e-3)
+    np.testing.assert_allclose(found.theta, 0, atol=2e-3)
     np.testing.assert_allclose(found.multipliers["volume"], -8 * np.pi / 3, rtol=5e-3)
     assert abs(float(found.equalities["volume"])) < 1e-4
     rows = found.history
@@ -74,7 +78,7 @@ def test_least_area_at_fixed_volume_is_a_ball_and_compiles_no_step():
     with count_compilations() as names:
         larger = axes_found(LBFGS, volume=2 * np.pi, start=(1.2, 1.0, 0.85))
     assert not names, names
-    np.testing.assert_allclose(larger.theta, 1.5 ** (1 / 3), atol=2e-3)
+    np.testing.assert_allclose(larger.theta, np.log(1.5) / 3, atol=2e-3)
 
 
 def test_neighbours_are_those_of_the_surface_that_is_reached():
@@ -85,12 +89,12 @@ def test_neighbours_are_those_of_the_surface_that_is_reached():
     found = js.optimize_shape(apart, shape, jnp.ones(3), optimizer=optax.sgd(1.0), rtol=1e-6)
     assert found.converged and found.history["renewed"].sum() >= 2
     np.testing.assert_allclose(found.theta, target, atol=1e-4)
-    held = np.sort(np.asarray(found.surface.neighbors.indices), axis=1)
-    wanted = np.sort(
-        np.asarray(js.discretize(found.surface.cloud, method=METHOD).neighbors.indices)
-    )
-    assert np.mean(held == wanted) > 0.9
-    assert np.mean(np.sort(np.asarray(ball().neighbors.indices)) == wanted) < 0.9
+    rows = lambda surface: [
+        set(row) for row in np.asarray(surface.neighbors.indices)[:, :20].tolist()
+    ]
+    wanted = rows(js.discretize(found.surface.cloud, method=METHOD))
+    shared = lambda surface: np.mean([len(a & b) / 20 for a, b in zip(rows(surface), wanted)])
+    assert shared(found.surface) > 0.9 and shared(ball()) < 0.8
 
 
 def test_steps_that_fold_are_halved_and_the_last_good_shape_is_kept():
@@ -159,7 +163,7 @@ def test_a_run_that_goes_on_from_its_file_ends_in_the_same_bits(tmp_path):
 def test_numbers_that_are_none():
     """At the start an error that names what it is; later, steps that are halved."""
     shape = js.MappedShape(scaled, ball())
-    root = lambda surface: jnp.sqrt(size(surface) - 1)
+    root = lambda surface: jnp.where(size(surface) > 1, size(surface), jnp.nan)
     with pytest.raises(ValueError, match="objective is nan at the first theta"):
         js.optimize_shape(root, shape, 0.5 * jnp.ones(3), optimizer=LBFGS)
     found = js.optimize_shape(root, shape, 1.1 * jnp.ones(3), optimizer=optax.sgd(0.3), throw=False)
@@ -187,7 +191,7 @@ def test_free_form_keeps_its_parameters_where_the_reference_is_another():
 def test_level_sets_are_spread_evenly_again():
     phi = lambda x, axes: jnp.sum((x / axes) ** 2) - 1
     shape = js.LevelSetShape(phi, ball(400))
-    axes = jnp.array([1.8, 1.0, 0.8])
+    axes = jnp.array([1.6, 1.0, 1.0])
     before = shape(axes)
     after = shape.renewed(axes, before.search())(axes)
 

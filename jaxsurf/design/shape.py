@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..arguments import as_float, differentiable, instance, switched_off
+from ..compiling import sized_jit
 from ..discretization import Discretization
-from ..failures import check, not_positive
+from ..failures import check, marking, not_positive
 from ..frames import frames_of
 from ..functions import Traced, canonical
 from ..motion import crossed
@@ -69,7 +70,7 @@ class AbstractShape(eqx.Module):
         Raises:
             ValueError: as `surface.moved`.
         """
-        surface = self(theta)
+        surface = unchecked_surface(self, theta)
         found = surface.moved(*_geometry(surface), search=search)
         return _followed(self, lambda x: _with_lists(x, found))
 
@@ -120,7 +121,7 @@ class LevelSetShape(AbstractShape):
 
     def renewed(self, theta: PyTree, search: NeighborSearch) -> LevelSetShape:
         """As of any shape; without border or mask, points are also spread evenly again."""
-        surface = self(theta)
+        surface = unchecked_surface(self, theta)
         cloud = surface.cloud
         if cloud.active is None and cloud.boundary is None:
             phi = lambda x: self.phi(x, theta)
@@ -132,8 +133,9 @@ class LevelSetShape(AbstractShape):
             spacing = ideal_spacing(float(jnp.sum(surface.areas)), cloud.n, dim=cloud.dim)
             even = relax(np.asarray(cloud.points), onto, spacing=spacing, steps=_SPREAD)
             points, normals = (jnp.asarray(a, cloud.points.dtype) for a in even)
-            surface = surface.moved(points, normals)
-        found = surface.moved(*_geometry(surface), search=search)
+        else:
+            points, normals = _geometry(surface)
+        found = surface.moved(points, normals, search=search)
         return eqx.tree_at(lambda s: s.surface, self, _with_lists(found, found))
 
 
@@ -241,7 +243,7 @@ class NormalShape(AbstractShape):
 
     def renewed(self, theta: Float[Array, " n"], search: NeighborSearch) -> NormalShape:
         """As of any shape; the surface at theta is the reference, its normals fitted again."""
-        surface = self(theta)
+        surface = unchecked_surface(self, theta)
         points, normals, degree = *_geometry(surface), surface.method.polynomial_degree
         normals = refit_normals(points, normals, surface.neighbors, degree=degree)
         found = surface.moved(points, normals, search=search)
@@ -286,6 +288,17 @@ def _function(f: Any, name: str) -> None:
 
 def _surface(surface: Any) -> None:
     instance(surface, Discretization, "surface", "js.discretize(cloud) makes one")
+
+
+def unchecked_surface(shape: AbstractShape, theta: PyTree) -> Discretization:
+    """The surface, its lists in whatever state."""
+    with marking():
+        return _unchecked(shape, theta)
+
+
+@sized_jit
+def _unchecked(shape, theta):
+    return shape(theta)
 
 
 def with_wear(shape: AbstractShape) -> AbstractShape:

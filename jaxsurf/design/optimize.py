@@ -16,6 +16,7 @@ import optax
 from jaxtyping import Array, Float, PyTree
 
 from ..arguments import floating, real, whole
+from ..discretization import Discretization
 from ..failures import needs_values
 from ..renew import NeighborSearch
 from ..time.checkpoint import Checkpoint, digest, read_back, written
@@ -215,7 +216,7 @@ class _Loop(NamedTuple):
             surface = shape(theta)
         except ValueError:
             surface = unchecked_surface(shape, theta)
-            if not renew or not set(np.asarray(surface.code).tolist()) <= {0, FAR}:
+            if not (renew and _is_only_far(surface)):
                 raise
             shape = shape.renewed(theta, surface.search())
         search = surface.search() if renew else None
@@ -348,6 +349,14 @@ class _Loop(NamedTuple):
             run.theta, shape, v.objective, v.equalities, v.inequalities, forces, rows,
             stopped == "converged", stopped or "under way",
         )  # fmt: skip
+
+
+def _is_only_far(surface: Discretization) -> bool:
+    """Whether nothing is wrong with a surface but its lists."""
+    try:
+        return set(np.asarray(surface.code).tolist()) <= {0, FAR}
+    except ValueError:  # it has no operators
+        return False
 
 
 def _renewed(shape: AbstractShape, theta, search: NeighborSearch) -> AbstractShape:

@@ -29,9 +29,10 @@ class ShapeOptimization(eqx.Module):
         stopped: why it ended.
 
     Example:
-        >>> shape = js.star_shape(js.discretize(js.sphere(200), method=js.GFDM(degree=2)), 0)
-        >>> bowl = lambda surface: (js.volume(surface) - 1) ** 2
-        >>> found = js.optimize_shape(bowl, shape, jnp.array([2.0]), optimizer=optax.lbfgs())
+        >>> surface = js.discretize(js.sphere(200), method=js.GFDM(degree=2))
+        >>> shape = js.MappedShape(lambda x, a: a * x, surface)
+        >>> bowl = lambda surface: (jnp.mean(surface.cloud.points**2) - 0.5) ** 2
+        >>> found = js.optimize_shape(bowl, shape, 1.0, optimizer=optax.lbfgs())
         >>> found.converged, found.history["objective"].shape == found.history["seconds"].shape
         (True, True)
     """
@@ -71,12 +72,14 @@ class OptimizationError(RuntimeError):
         solution: what there is, a `ShapeOptimization` with the last good shape.
 
     Example:
-        >>> shape = js.star_shape(js.discretize(js.sphere(200), method=js.GFDM(degree=2)), 0)
-        >>> small = lambda surface: jnp.sqrt(js.volume(surface) - 1)
+        >>> surface = js.discretize(js.sphere(200), method=js.GFDM(degree=2))
+        >>> shape = js.MappedShape(lambda x, a: a * x, surface)
+        >>> size = lambda surface: jnp.mean(surface.cloud.points**2)
+        >>> hole = lambda surface: jnp.where(size(surface) > 0.2, size(surface), jnp.nan)
         >>> try:
-        ...     js.optimize_shape(small, shape, jnp.array([2.5]), optimizer=optax.sgd(1.0))
+        ...     found = js.optimize_shape(hole, shape, 1.0, optimizer=optax.sgd(0.3))
         ... except js.OptimizationError as error:
-        ...     print(js.volume(error.solution.surface) > 1)
+        ...     print(bool(size(error.solution.surface) > 0.2))
         True
     """
 

@@ -67,6 +67,14 @@ EXPERIMENTS = {
         "poisson",
         "Study: Poisson on ellipsoid, torus and a surface of genus 2; scans; orders and steps",
     ),
+    "hear-the-shape": (
+        "hear_the_shape",
+        "Shapes: the axes of an ellipsoid from its first 12 eigenvalues",
+    ),
+    "isoperimetric": (
+        "isoperimetric",
+        "Shapes: from a bumpy star to the sphere, by least area at fixed volume",
+    ),
     "integrals": ("integrals", "Study: area, volume and integrals of curvature, by order"),
     "slopes": ("slopes", "Study: observed orders of the Laplacian on sphere, ellipsoid and torus"),
     "stability": (

@@ -356,3 +356,15 @@ def _described(value: Any, array: Any) -> str:
         return _short(value)
     kind = {"O": "objects", "U": "text", "S": "text"}.get(array.dtype.kind, str(array.dtype))
     return f"an array of {kind} of shape {array.shape}"
+
+
+def floating(tree: Any, name: str) -> Any:
+    """The tree with its leaves as arrays, which have to be of a floating-point type."""
+    leaves = jax.tree.leaves(tree)
+    if not leaves:
+        raise ValueError(f"{name} has no arrays")
+    for leaf in leaves:
+        kind = getattr(leaf, "dtype", type(leaf).__name__)
+        if kind != "float" and (isinstance(kind, str) or not jnp.issubdtype(kind, jnp.floating)):
+            raise TypeError(f"{name} has a leaf of type {kind}, expected floating-point arrays")
+    return jax.tree.map(lambda leaf: finite(jnp.asarray(leaf), name), tree)

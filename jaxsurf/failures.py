@@ -17,6 +17,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+# Asked by programs while they are traced; JAX keeps those apart that were told otherwise.
+_marking = jax.make_user_context(default_value=False)
+
+
+def marking() -> Any:
+    """Within it, programs that are traced put NaN where there is anything bad, and go on.
+
+    For searches, which try what may not exist.
+    """
+    return _marking(True)
+
 
 def is_concrete(*trees: Any) -> bool:
     """True if no array in these is being traced, so that their values can be looked at."""
@@ -112,11 +123,15 @@ def refuse(x: Any, bad: Any, message: str, values: Any = None, **how: Any) -> An
 
     Raises:
         ValueError: names the first bad point, its value, and how many there are. Compiled programs
-            cannot name them: theirs is an `EquinoxRuntimeError`.
+            cannot name them: theirs is an `EquinoxRuntimeError`. Those traced within `marking`
+            have NaN in all of a floating-point array instead.
     """
     if is_concrete(bad):
         raise_at(bad, message, values, **how)
         return x
+    if _marking.value:
+        inexact = eqx.is_inexact_array(x)
+        return jnp.where(jnp.any(bad), jnp.nan, x) if inexact else x
     message = message.replace("{more}", "")
     return eqx.error_if(x, bad, re.sub(r"\{\w+[^}]*\}", "(to be seen outside jit)", message))
 

@@ -172,6 +172,7 @@ class _Lists(eqx.Module):
     code: Int[Array, " r"]
 
 
+@functools.partial(jax.jit, static_argnums=(2, 3))
 def _reach(cloud, before, k: int, usual: int):
     """Within which most points find `usual` neighbours, from where their last k are now."""
     x = cloud.points

@@ -574,11 +574,11 @@ EXEMPT = {
     "meshes": {"TriangleMesh", "clean_mesh", "sample_mesh"},
     "moves the points of a surface, as `moved` does": {
         "AbstractShape", "LevelSetShape", "MappedShape", "NormalShape", "rigid_motion",
-        "star_shape", "spherical_harmonics",
+        "star_shape", "spherical_harmonics", "optimize_shape", "ShapeOptimization",
     },
     "takes any function": {"taylor_remainders", "TaylorRemainders"},
     "looks at the kind of a problem": {"choose_solver"},
-    "an error": {"IntegrationError"},
+    "an error": {"IntegrationError", "OptimizationError"},
     "names points that are on": {"free"},
     "compared in test_renew.py, a third of the points off": {"NeighborSearch"},
     "know no cloud: what is made with operators takes their mask": {"Diagonal", "identity"},

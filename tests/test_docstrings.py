@@ -10,6 +10,7 @@ import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 import jaxsurf as js
@@ -67,6 +68,6 @@ def test_accuracy_in_single_precision_is_stated():
 @pytest.mark.parametrize("name", MODULES)
 def test_examples(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    names = dict(js=js, jax=jax, jnp=jnp, np=np)
+    names = dict(js=js, jax=jax, jnp=jnp, np=np, optax=optax)
     result = doctest.testmod(importlib.import_module(name), extraglobs=names)
     assert result.failed == 0

@@ -15,6 +15,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 import jaxsurf as js
 
@@ -124,6 +125,17 @@ def _quartic(u):
     return jnp.sum(u**4)
 
 
+def _reach(surface, a):
+    return jnp.mean(surface.cloud.points**2) * a
+
+
+def _scaled(x, a):
+    return a * x
+
+
+_SGD = optax.sgd(0.1)
+
+
 class Made:
     """What calls need; each thing is made when it is first asked for."""
 
@@ -230,6 +242,16 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
         "closed",
         "surface",
         lambda m: js.star_shape(m.surface, 2)(m.number * np.eye(9)[0]).cloud.points,
+    ),
+    "optimize_shape": (
+        "closed",
+        "surface",
+        lambda m: (
+            js.optimize_shape(
+                _reach, js.MappedShape(_scaled, m.surface), jnp.array(m.number), optimizer=_SGD,
+                args=(jnp.array(m.number),), steps=3,
+            ).theta
+        ),
     ),
     "rigid_motion": (
         "closed",

@@ -9,15 +9,24 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..arguments import as_float, differentiable, instance, switched_off
+from ..compiling import sized_jit
 from ..discretization import Discretization
-from ..failures import check, not_positive
+from ..failures import check, marking, not_positive
 from ..frames import frames_of
 from ..functions import Traced, canonical
 from ..motion import crossed
+from ..normals import refit_normals
+from ..renew import NeighborSearch
 from ..shapes.implicit import level_set_normals, project_to_level_set
+from ..shapes.sampling import relax
+from ..shapes.spacing import ideal_spacing
+
+# Steps of repulsion by which points are spread again over a level set.
+_SPREAD = 10
 
 
 class AbstractShape(eqx.Module):
@@ -46,6 +55,24 @@ class AbstractShape(eqx.Module):
         Raises:
             ValueError: as `surface.moved`; under `jit`, `vmap` and `grad` see its `code`.
         """
+
+    def renewed(self, theta: PyTree, search: NeighborSearch) -> AbstractShape:
+        r"""The same family, its neighbours those that points have at $\theta$; not traced.
+
+        For shapes that go far, as in `js.optimize_shape`. All arrays keep their shapes, so that
+        nothing is compiled again. A shape of one's own need not write this: the surfaces in it
+        are given the lists.
+
+        Args:
+            theta: where.
+            search: from `surface.search()`, with as many slots as the lists.
+
+        Raises:
+            ValueError: as `surface.moved`.
+        """
+        surface = unchecked_surface(self, theta)
+        found = surface.moved(*_geometry(surface), search=search)
+        return _followed(self, lambda x: _with_lists(x, found))
 
 
 class LevelSetShape(AbstractShape):
@@ -91,6 +118,25 @@ class LevelSetShape(AbstractShape):
             start = switched_off(cloud.active, start, start[jnp.argmax(cloud.active)])
         points = project_to_level_set(phi, start)
         return self.surface.moved(points, level_set_normals(phi, points))
+
+    def renewed(self, theta: PyTree, search: NeighborSearch) -> LevelSetShape:
+        """As of any shape; without border or mask, points are also spread evenly again."""
+        surface = unchecked_surface(self, theta)
+        cloud = surface.cloud
+        if cloud.active is None and cloud.boundary is None:
+            phi = lambda x: self.phi(x, theta)
+
+            def onto(x):
+                x = project_to_level_set(phi, jnp.asarray(x, cloud.points.dtype), throw=False)
+                return x, level_set_normals(phi, x)
+
+            spacing = ideal_spacing(float(jnp.sum(surface.areas)), cloud.n, dim=cloud.dim)
+            even = relax(np.asarray(cloud.points), onto, spacing=spacing, steps=_SPREAD)
+            points, normals = (jnp.asarray(a, cloud.points.dtype) for a in even)
+        else:
+            points, normals = _geometry(surface)
+        found = surface.moved(points, normals, search=search)
+        return eqx.tree_at(lambda s: s.surface, self, _with_lists(found, found))
 
 
 class MappedShape(AbstractShape):
@@ -163,11 +209,12 @@ def _mapped(f: Traced, points, tangents):
 
 
 class NormalShape(AbstractShape):
-    r"""Free form: the points of a reference moved along its normals, $x + \theta n$.
+    r"""Free form: the points of a reference moved along its normals, $x + (\theta - \theta_0) n$.
 
     Args:
         surface: the reference. Parameters are one displacement for each point, `(n,)`, in units
             of length, which should be smooth over a few points; normals are carried along.
+        start: the displacements $\theta_0$ that belong to the reference; zero if None.
 
     Accuracy: normals as `surface.gradient`, $O(h^p)$.
     Differentiable: forward and reverse in theta, for fixed neighbours.
@@ -182,14 +229,25 @@ class NormalShape(AbstractShape):
     """
 
     surface: Discretization
+    start: Float[Array, " n"]
 
-    def __check_init__(self):
-        _surface(self.surface)
+    def __init__(self, surface: Discretization, start: Float[Array, " n"] | None = None):
+        _surface(surface)
+        start = jnp.zeros_like(surface.cloud.points[:, 0]) if start is None else start
+        self.surface, self.start = surface, as_float(start, "start", (surface.n,))
 
     def __call__(self, theta: Float[Array, " n"]) -> Discretization:
         theta = as_float(theta, "displacements", (self.surface.n,))
         cloud = self.surface.cloud
-        return self.surface.moved(cloud.points + theta[:, None] * cloud.normals)
+        return self.surface.moved(cloud.points + (theta - self.start)[:, None] * cloud.normals)
+
+    def renewed(self, theta: Float[Array, " n"], search: NeighborSearch) -> NormalShape:
+        """As of any shape; the surface at theta is the reference, its normals fitted again."""
+        surface = unchecked_surface(self, theta)
+        points, normals, degree = *_geometry(surface), surface.method.polynomial_degree
+        normals = refit_normals(points, normals, surface.neighbors, degree=degree)
+        found = surface.moved(points, normals, search=search)
+        return NormalShape(_with_lists(found, found), theta)
 
 
 def rigid_motion(
@@ -230,3 +288,37 @@ def _function(f: Any, name: str) -> None:
 
 def _surface(surface: Any) -> None:
     instance(surface, Discretization, "surface", "js.discretize(cloud) makes one")
+
+
+def unchecked_surface(shape: AbstractShape, theta: PyTree) -> Discretization:
+    """The surface, its lists in whatever state."""
+    with marking():
+        return _unchecked(shape, theta)
+
+
+@sized_jit
+def _unchecked(shape, theta):
+    return shape(theta)
+
+
+def with_wear(shape: AbstractShape) -> AbstractShape:
+    """The same shape, whose surfaces know where their neighbours were found."""
+    known = lambda x: x.cloud.points if x.found_at is None else x.found_at
+    lists = lambda x: (x.neighbors, x.method, x.border, known(x))
+    return _followed(shape, lambda x: Discretization(x.cloud, *lists(x)))
+
+
+def _followed(shape: AbstractShape, change: Callable) -> AbstractShape:
+    """A shape with every surface in it changed."""
+    is_one = lambda x: isinstance(x, Discretization)
+    return jax.tree.map(lambda x: change(x) if is_one(x) else x, shape, is_leaf=is_one)
+
+
+def _geometry(surface: Discretization) -> tuple[Array, Array]:
+    return surface.cloud.points, surface.cloud.normals
+
+
+def _with_lists(surface: Discretization, found: Discretization) -> Discretization:
+    """A surface with the lists of another of the same points."""
+    lists = (found.neighbors, surface.method, surface.border, found.cloud.points)
+    return Discretization(surface.cloud, *lists)

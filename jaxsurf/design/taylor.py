@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ..arguments import finite, on_host
+from ..arguments import finite, floating, on_host
 from ..failures import needs_values, not_positive, raise_at
 
 # How many steps there are by default, and what multiple of the rounding of f and x is round-off.
@@ -94,7 +93,7 @@ def taylor_remainders(
     if not callable(f):
         raise TypeError(f"f is a {type(f).__name__}, expected a function")
     needs_values("x and direction", x, direction)
-    x, direction = _floating(x, "x"), _floating(direction, "direction")
+    x, direction = floating(x, "x"), floating(direction, "direction")
     shapes = [jax.tree.map(jnp.shape, tree) for tree in (x, direction)]
     if shapes[0] != shapes[1]:
         raise ValueError(f"direction has shapes {shapes[1]}, x has {shapes[0]}")
@@ -123,15 +122,3 @@ def taylor_remainders(
     remainders = np.abs(values - float(value) - at * derivative)
     rounding = _ROUNDING * epsilon * (abs(float(value)) + size(gradient, x))
     return TaylorRemainders(at, remainders, derivative, float(rounding))
-
-
-def _floating(tree: PyTree, name: str) -> Any:
-    """The tree with its leaves as arrays, which have to be of a floating-point type."""
-    leaves = jax.tree.leaves(tree)
-    if not leaves:
-        raise ValueError(f"{name} has no arrays")
-    for leaf in leaves:
-        kind = getattr(leaf, "dtype", type(leaf).__name__)
-        if kind != "float" and (isinstance(kind, str) or not jnp.issubdtype(kind, jnp.floating)):
-            raise TypeError(f"{name} has a leaf of type {kind}, expected floating-point arrays")
-    return jax.tree.map(lambda leaf: finite(jnp.asarray(leaf), name), tree)

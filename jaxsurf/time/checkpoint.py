@@ -36,7 +36,8 @@ class Checkpoint(eqx.Module):
         path: of the file, a NumPy archive; replaced in one piece, so that a run that is killed
             while writing leaves the one before.
         every: time between two files, in the units of t. Every part picks its first step anew
-            and ends with a step of its own, so that many short parts cost steps.
+            and ends with a step of its own, so that many short parts cost steps. Of an
+            optimisation, the number of its steps, which cost the same.
 
     Raises:
         TypeError: a path or a time that is none.
@@ -103,12 +104,12 @@ def integrate_in_parts(
     asked = np.array([sub.t0, *[True] * len(between), sub.t1])
 
     path = Path(checkpoint.path)
-    key = _digest((checkpoint.every, run))
+    key = digest((checkpoint.every, run))
     one = jax.eval_shape(lambda: sub.fn(run.t0, run.u0, run.args))
     saved = jax.tree.map(lambda y: np.zeros((len(times), *y.shape), y.dtype), one)
     now = _Progress(np.array(0), jax.tree.map(np.asarray, run.u0), saved, np.zeros(3, int))
     if path.exists():
-        now = _read(path, key, now)
+        now = read_back(path, key, now)
     reached = times <= ends[int(now.part)]
     last_state = run.saveat.subs[1]
     solution, last = None, float(ends[int(now.part)])
@@ -131,7 +132,7 @@ def integrate_in_parts(
             now = _Progress(np.array(part + 1), state, now.saved, counts)
             if solution.result != dfx.RESULTS.successful:
                 break
-            _write(path, key, now)
+            written(path, key, now)
             bar.update()
     return _joined(solution, now, times, asked, reached, last, sub, run.args)
 
@@ -169,7 +170,7 @@ def _joined(
 # --- the file ------------------------------------------------------------------------------
 
 
-def _digest(content: PyTree) -> str:
+def digest(content: PyTree) -> str:
     """Of all numbers, of all that is static, and of what functions compute."""
     found = hashlib.sha256()
     leaves, structure = jax.tree.flatten(content)
@@ -189,7 +190,7 @@ def _described(value: Any) -> str:
     if code is None:
         return _without_addresses(repr(value))
     cells = [cell.cell_contents for cell in value.__closure__ or ()]
-    inside = _digest((cells, value.__defaults__)) if cells or value.__defaults__ else ""
+    inside = digest((cells, value.__defaults__)) if cells or value.__defaults__ else ""
     return _without_addresses(f"{value.__qualname__}{code.co_code!r}{code.co_consts}{inside}")
 
 
@@ -198,19 +199,21 @@ def _without_addresses(text: str) -> str:
     return re.sub(r" at 0x[0-9a-f]+", "", text)
 
 
-def _write(path: Path, key: str, now: _Progress) -> None:
+def written(path: Path, key: str, now: PyTree) -> None:
+    """A file of the arrays of `now`, in one piece."""
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(now)]
     data = {f"leaf_{i:04d}": leaf for i, leaf in enumerate(leaves)}
     partial = path.with_name(path.name + ".part")
     with open(partial, "wb") as file:
-        seal = np.array(_digest((key, leaves)))
+        seal = np.array(digest((key, leaves)))
         np.savez(file, key=np.array(key), seal=seal, **data)  # type: ignore[arg-type]
         file.flush()
         os.fsync(file.fileno())
     os.replace(partial, path)
 
 
-def _read(path: Path, key: str, like: _Progress) -> _Progress:
+def read_back(path: Path, key: str, like: Any) -> Any:
+    """What was written: of the same run, with arrays as in `like`."""
     expected, structure = jax.tree.flatten(like)
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -218,7 +221,7 @@ def _read(path: Path, key: str, like: _Progress) -> _Progress:
             leaves = [archive[name] for name in sorted(archive.files) if name.startswith("leaf_")]
     except Exception as error:  # a damaged archive raises anything
         raise ValueError(f"{path} does not hold a checkpoint, or is damaged: {error}") from error
-    if seal != _digest((found, leaves)):
+    if seal != digest((found, leaves)):
         raise ValueError(f"{path} is damaged: its content does not have the digest {seal}")
     shapes = [[(np.shape(leaf), np.asarray(leaf).dtype) for leaf in x] for x in (leaves, expected)]
     if found != key or shapes[0] != shapes[1]:

@@ -8,6 +8,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 import jaxsurf as js
 
@@ -40,7 +41,35 @@ def taylor(f=lambda x: jnp.sum(jnp.sin(x)), x=X, direction=X, **options):
     return lambda: js.taylor_remainders(f, x, direction, **options)
 
 
+def reach(surface):
+    return jnp.mean(surface.cloud.points**2)
+
+
+def larger(x, a):
+    return a * x
+
+
+def optimized(f=reach, theta=1.0, optimizer=optax.sgd(0.1), **options):
+    shape = lambda: js.MappedShape(larger, surface())
+    return lambda: js.optimize_shape(f, shape(), theta, optimizer=optimizer, **options)
+
+
 CALLS = [
+    ("optimize_shape", "a number for the objective", optimized(f=1.0), ("objective is a float", "function")),
+    ("optimize_shape", "an objective with several values", optimized(f=lambda s: s.cloud.points[0]), ("objective", "(3,)", "one number")),
+    ("optimize_shape", "an objective that is no number", optimized(f=lambda s: jnp.log(-reach(s))), ("objective is nan", "first theta")),
+    ("optimize_shape", "a slope that is no number", optimized(f=lambda s: jnp.sqrt(0 * reach(s))), ("gradient", "not finite")),
+    ("optimize_shape", "whole parameters", optimized(theta=1), ("theta has a leaf of type int", "floating")),
+    ("optimize_shape", "parameters that flatten", optimized(theta=0.0), ("f flattens", "point 0")),
+    ("optimize_shape", "a function for an optimiser", optimized(optimizer=reach), ("optimizer", "GradientTransformation", "optax.lbfgs()")),
+    ("optimize_shape", "a constraint without a name", optimized(equalities=[reach]), ("equalities", "Mapping", "volume")),
+    ("optimize_shape", "a number for a constraint", optimized(inequalities={"a": 1.0}), ("inequalities['a'] is a float", "function")),
+    ("optimize_shape", "a constraint that is no number", optimized(equalities={"a": lambda s: reach(s) / 0}), ("constraint 'a' is inf", "first theta")),
+    ("optimize_shape", "one name twice", optimized(equalities={"a": reach}, inequalities={"a": reach}), ("'a'", "taken")),
+    ("optimize_shape", "no steps", optimized(steps=0), ("steps = 0", "at least 1")),
+    ("optimize_shape", "a penalty below zero", optimized(penalty=-1.0), ("penalty = -1", "above 0")),
+    ("optimize_shape", "a path for a checkpoint", optimized(checkpoint="run.npz"), ("checkpoint", "Checkpoint", "every=10")),
+    ("optimize_shape", "a surface for a shape", lambda: js.optimize_shape(reach, surface(), 1.0, optimizer=optax.sgd(0.1)), ("shape", "Shape", "star_shape")),
     ("taylor_remainders", "f a number", taylor(f=1.0), ("f is a float", "function")),
     ("taylor_remainders", "f with several values", taylor(f=jnp.sin), ("f returns", "(3,)", "one real number")),
     ("taylor_remainders", "f a complex value", taylor(f=lambda x: jnp.sum(1j * x)), ("f returns", "complex128", "one real number")),

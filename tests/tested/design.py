@@ -6,7 +6,35 @@ _CURVES = _FUN + "test_curves_compiled_mapped_and_in_single_precision"
 _MOVED = {"points, normals": _FUN + "test_derivatives_in_the_geometry"}
 _HOST = "(host only: concrete arrays)"
 
+_OPT = "test_optimize.py::"
+
 TESTED = {
+    "optimize_shape": {
+        "value": _OPT + "test_least_area_at_fixed_volume_is_a_ball_and_compiles_no_step, "
+        "test_optimize.py::test_neighbours_are_those_of_the_surface_that_is_reached, "
+        "test_optimize.py::test_inequalities_hold_and_press",
+        "gradient": "(it takes derivatives)",
+        "jit": _HOST,
+        "vmap": _HOST,
+        "float32": _OPT + "test_single_precision",
+        "bad input": "malformed",
+    },
+    "ShapeOptimization": {
+        "value": _OPT + "test_least_area_at_fixed_volume_is_a_ball_and_compiles_no_step",
+        "gradient": "(made by optimize_shape)",
+        "jit": _HOST,
+        "vmap": _HOST,
+        "float32": _OPT + "test_single_precision",
+        "bad input": "(made by optimize_shape)",
+    },
+    "OptimizationError": {
+        "value": _OPT + "test_steps_that_fold_are_halved_and_the_last_good_shape_is_kept",
+        "gradient": "(raised, not made)",
+        "jit": "(raised, not made)",
+        "vmap": "(raised, not made)",
+        "float32": "(raised, not made)",
+        "bad input": "(raised, not made)",
+    },
     "taylor_remainders": {
         "value": _TAYLOR + "test_slopes_of_right_and_wrong_derivatives, "
         "test_taylor.py::test_linear_functions_leave_nothing",

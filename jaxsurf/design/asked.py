@@ -1,0 +1,63 @@
+"""What an optimisation asks of what it is given."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import optax
+
+from ..arguments import instance
+from ..time.checkpoint import Checkpoint
+from .lagrangian import Values
+from .outcome import COLUMNS
+from .shape import AbstractShape
+
+# What is wrong with a surface, by its code.
+FAR = 4
+ILL = {
+    1: "points or normals are not finite",
+    2: "the surface folds",
+    3: "the objective, a constraint or the gradient is not finite",
+    FAR: "lists of neighbours do not reach",
+}
+
+
+def constraints(given: Any, name: str) -> dict[str, Callable]:
+    """Constraints by their names."""
+    if given is None:
+        return {}
+    instance(given, Mapping, name, '{"volume": lambda surface: js.volume(surface) - 1}, say')
+    for key, f in given.items():
+        if not callable(f):
+            raise TypeError(f"{name}[{key!r}] is a {type(f).__name__}, expected a function")
+    return dict(given)
+
+
+def check_asked(objective, shape, theta, optimizer, asked, callback, checkpoint) -> None:
+    for name, f in (("objective", objective), ("callback", callback)):
+        if not callable(f) and not (name == "callback" and f is None):
+            raise TypeError(f"{name} is a {type(f).__name__}, expected a function")
+    instance(shape, AbstractShape, "shape", "js.star_shape(surface, 4) or js.MappedShape, say")
+    instance(optimizer, optax.GradientTransformation, "optimizer", "optax.lbfgs(), say")
+    if checkpoint is not None:
+        instance(checkpoint, Checkpoint, "checkpoint", 'js.Checkpoint("run.npz", every=10)')
+    taken = [name for some in asked for name in some]
+    for name in taken:
+        if name in COLUMNS or taken.count(name) > 1:
+            raise ValueError(f"a constraint is called {name!r}: that name is taken")
+
+
+def refuse_start(values: Values) -> None:
+    """Say what is not good at the start."""
+    code = int(values.code)
+    named = {"objective": values.objective} | values.equalities | values.inequalities
+    for name, x in named.items():
+        if not np.isfinite(np.asarray(x)).all():
+            kind = "objective" if name == "objective" else f"constraint {name!r}"
+            raise ValueError(f"{kind} is {np.asarray(x)} at the first theta, expected a number")
+    if code == 3:
+        raise ValueError("the gradient at the first theta is not finite, where the objective is")
+    if code:
+        raise ValueError(f"at the first theta {ILL[code]}")

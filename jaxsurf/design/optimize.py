@@ -1,0 +1,398 @@
+r"""One call from an objective on surfaces to the shape that minimises it."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, PyTree
+
+from ..arguments import floating, real, whole
+from ..discretization import Discretization
+from ..failures import needs_values
+from ..renew import NeighborSearch
+from ..time.checkpoint import Checkpoint, digest, read_back, written
+from .asked import FAR, ILL, check_asked, constraints, refuse_start
+from .lagrangian import (
+    Multipliers,
+    Problem,
+    Values,
+    direction,
+    evaluated,
+    kinds,
+    started,
+    strong,
+)
+from .outcome import COLUMNS, OptimizationError, ShapeOptimization
+from .shape import AbstractShape, unchecked_surface, with_wear
+
+# A step that fails is halved so often.
+_HALVINGS = 12
+# Forces are corrected after so many steps, or when the gradient has fallen to a share of its first.
+_INNER, _GOAL = 20, 0.1
+# A violation that does not fall to this share makes the penalty grow by that factor; one that
+# stays above the last share so many times in a row cannot be mended.
+_FALLS, _GROWTH, _STAYS, _STALLS = 0.25, 4.0, 0.9, 8
+
+
+class _Run(NamedTuple):
+    """All that a step begins with, as arrays: what is on disk.
+
+    Args:
+        step: how many were made.
+        theta, state: parameters, and what the optimiser remembers.
+        multipliers, values: forces, and what is seen at theta.
+        lists: the arrays of the shape.
+        first: norm of the first gradient.
+        goal: share of it at which the forces are corrected.
+        since: steps since they were.
+        violation: what it was then.
+        stalls: how often in a row it has stayed.
+        history: one row a step, NaN where there was none.
+    """
+
+    step: Any
+    theta: PyTree
+    state: PyTree
+    multipliers: Multipliers
+    values: Values
+    lists: PyTree
+    first: Any
+    goal: Any
+    since: Any
+    violation: Any
+    stalls: Any
+    history: dict[str, np.ndarray]
+
+
+def optimize_shape(
+    objective: Callable[..., Float[Array, ""]],
+    shape: AbstractShape,
+    theta: PyTree[Float[Array, "..."]],
+    *,
+    optimizer: optax.GradientTransformation,
+    equalities: Mapping[str, Callable] | None = None,
+    inequalities: Mapping[str, Callable] | None = None,
+    args: tuple = (),
+    steps: int = 100,
+    rtol: float = 1e-4,
+    ctol: float = 1e-4,
+    penalty: float | None = None,
+    renew: bool = True,
+    callback: Callable[[ShapeOptimization], bool | None] | None = None,
+    checkpoint: Checkpoint | None = None,
+    throw: bool = True,
+) -> ShapeOptimization:
+    r"""Parameters that minimise a function of a surface, under constraints on it.
+
+    Constraints are met by an augmented Lagrangian: multipliers that are corrected whenever its
+    gradient has fallen tenfold, or every 20 steps, and a penalty that grows fourfold where that
+    does not serve. Steps after which the surface folds or a number is not finite are halved.
+    Neighbours are found anew once the surface was sheared or stretched by about an eighth
+    (`AbstractShape.renewed`); the optimiser keeps its state, and nothing is compiled again.
+
+    Args:
+        objective: $f(S)$, of a `Discretization` and `args`; returns a number.
+        shape: the family of surfaces.
+        theta: where to start, any pytree of floating-point arrays.
+        optimizer: of optax: `optax.lbfgs()`, `optax.adam(1e-2)`, a chain.
+        equalities: $h(S) = 0$, functions like the objective by their names, of numbers or arrays;
+            best of size one, like `lambda s: js.volume(s) - 1`.
+        inequalities: $g(S) \le 0$, likewise.
+        args: further arguments of all these; other values compile nothing, where other
+            functions do.
+        steps: at most.
+        rtol: it has converged where the gradient of the Lagrangian is this share of its first,
+        ctol: and constraints are kept to this.
+        penalty: $\mu$ at first, in units of the objective over those of a constraint squared;
+            if None ten times the first objective, at least 10: much less, and to give a
+            constraint up may cost less than to keep it.
+        renew: find neighbours anew. If False they are those of `shape`, and known to the program,
+            as `js.solve` asks for without a preconditioner.
+        callback: called with the `ShapeOptimization` so far after each step; True ends it.
+        checkpoint: where all is written after every so many steps; if the file is there, the same
+            run goes on from it and ends in the same bits.
+        throw: raise where it cannot go on; if False, see `stopped`.
+
+    Returns:
+        `ShapeOptimization`: `theta`, `surface`, `objective`, `multipliers`, `history`. Steps that
+        are used up are no error.
+
+    Accuracy: of the functions; gradients are exact for fixed neighbours. In float32 the radius of
+        a ball is found within 1e-3 (`tests/test_optimize.py::test_single_precision`).
+    Raises:
+        TypeError: functions, a shape, an optimiser, a checkpoint that are none; parameters that are
+            no floating-point arrays.
+        ValueError: a first surface or value that is not good, in the words of `shape` or by name;
+            numbers out of range; functions that return something else; traced arrays.
+        OptimizationError: no good step is left, or constraints contradict each other; its
+            `solution` has the last good shape.
+
+    Example:
+        >>> surface = js.discretize(js.sphere(300), method=js.GFDM(degree=2))
+        >>> shape = js.MappedShape(lambda x, axes: axes * x, surface)
+        >>> found = js.optimize_shape(
+        ...     lambda surface: surface.areas.sum(), shape, jnp.array([1.3, 1.0, 0.8]),
+        ...     equalities={"volume": lambda surface: js.volume(surface) - 4 * jnp.pi / 3},
+        ...     optimizer=optax.lbfgs(),
+        ... )
+        >>> found.converged, bool(jnp.allclose(found.theta, 1, atol=1e-2))
+        (True, True)
+    """
+    asked = constraints(equalities, "equalities"), constraints(inequalities, "inequalities")
+    check_asked(objective, shape, theta, optimizer, asked, callback, checkpoint)
+    theta = strong(floating(theta, "theta"))
+    numbers = dict(
+        steps=whole(steps, "steps", least=1),
+        rtol=real(rtol, "rtol", least=0),
+        ctol=real(ctol, "ctol", above=0),
+        penalty=None if penalty is None else real(penalty, "penalty", above=0),
+        renew=bool(renew),
+    )
+    needs_values("theta, shape, args and tolerances", theta, shape, args, numbers)
+    loop = _Loop(objective, *asked, tuple(args), optimizer, numbers, callback, checkpoint)
+    found, failed = loop.run(shape, theta)
+    if failed and throw:
+        raise OptimizationError(found.stopped, found)
+    return found
+
+
+class _Held:
+    """A shape whose arrays are constants of the programs."""
+
+    def __init__(self, shape: AbstractShape):
+        self.shape = shape
+
+    def __call__(self, theta):
+        return self.shape(theta)
+
+    def __hash__(self):
+        return id(self.shape)
+
+    def __eq__(self, other):
+        return isinstance(other, _Held) and self.shape is other.shape
+
+
+class _File(NamedTuple):
+    """Where a run is written, after how many steps, and what it is known by."""
+
+    path: Path
+    every: int
+    told: str
+
+    def read(self, run: _Run) -> _Run:
+        """As far as it has come, if it is there."""
+        if not self.path.exists():
+            return run
+        found = read_back(self.path, self.told, run)
+        place = lambda new, old: jnp.asarray(new) if isinstance(old, jax.Array) else new
+        return jax.tree.map(place, found, run)
+
+
+class _Loop(NamedTuple):
+    """What does not change during a run."""
+
+    objective: Callable
+    equalities: dict[str, Callable]
+    inequalities: dict[str, Callable]
+    args: tuple
+    optimizer: Any
+    numbers: dict[str, Any]
+    callback: Callable | None
+    checkpoint: Checkpoint | None
+
+    def run(self, shape: AbstractShape, theta) -> tuple[ShapeOptimization, bool]:
+        """What is found, and whether it failed."""
+        clock, renew = time.perf_counter(), self.numbers["renew"]
+        try:
+            surface = shape(theta)
+        except ValueError:
+            surface = unchecked_surface(shape, theta)
+            if not (renew and _is_only_far(surface)):
+                raise
+            shape = shape.renewed(theta, surface.search())
+        search = surface.search() if renew else None
+        shape = with_wear(shape) if renew else shape
+        problem = self.problem(shape)
+        run = self.first(problem, shape, theta)
+        file = None
+        if self.checkpoint is not None:
+            told = digest((self._replace(callback=None, checkpoint=None), shape, theta))
+            file = _File(Path(self.checkpoint.path), max(1, round(self.checkpoint.every)), told)
+            run = file.read(run)
+            shape = eqx.combine(run.lists, shape)
+        clock -= float(run.history["seconds"][int(run.step)])
+        stopped, failed = self.ended(run), False
+        while not stopped:
+            run, shape, stopped = self.step(self.problem(shape), shape, run, search)
+            run.history["seconds"][int(run.step)] = time.perf_counter() - clock
+            failed = bool(stopped)
+            if failed:
+                break
+            stopped = self.ended(run)
+            if file is not None and (stopped or int(run.step) % file.every == 0):
+                written(file.path, file.told, run)
+            if self.callback is not None and self.callback(self.found(run, shape, stopped)):
+                stopped = stopped or "ended by the callback"
+        return self.found(run, shape, stopped), failed
+
+    def problem(self, shape) -> Problem:
+        held = shape if self.numbers["renew"] else _Held(shape)
+        return Problem(held, self.objective, self.equalities, self.inequalities, self.args)
+
+    def first(self, problem, shape, theta) -> _Run:
+        """At the start, if it is good."""
+        f, h, g = kinds(problem, theta)
+        if f.shape != ():
+            raise ValueError(f"objective returns shape {f.shape}, expected one number")
+        nothing = lambda some: {name: jnp.zeros(x.shape, x.dtype) for name, x in some.items()}
+        given = self.numbers["penalty"]
+        mu = jnp.asarray(10 if given is None else given, f.dtype)
+        multipliers = Multipliers(nothing(h), nothing(g), mu)
+        theta, values = evaluated(problem, theta, multipliers)
+        refuse_start(values)
+        if given is None and (h or g):
+            mu = 10 * jnp.maximum(1, jnp.abs(values.objective))
+            multipliers = multipliers._replace(penalty=mu)
+            theta, values = evaluated(problem, theta, multipliers)
+        rows = self.numbers["steps"] + 1
+        history = {name: np.full(rows, np.nan) for name in COLUMNS}
+        for name, x in (values.equalities | values.inequalities).items():
+            history[name] = np.full((rows, *x.shape), np.nan)
+        zero = np.array(0)
+        run = _Run(
+            zero, theta, started(self.optimizer, theta), multipliers, values,
+            eqx.filter(shape, eqx.is_array), values.size, np.array(_GOAL), zero,
+            np.array(np.inf), zero, history,
+        )  # fmt: skip
+        _note(run, refused=0, renewed=0)
+        history["seconds"][0] = 0.0
+        return run
+
+    def step(self, problem, shape, run: _Run, search) -> tuple[_Run, AbstractShape, str]:
+        """One step, what it asks for, and why there is none."""
+        updates, state = direction(
+            self.optimizer, problem, run.theta, run.multipliers, run.values, run.state
+        )
+        for refused in range(_HALVINGS + 1):
+            half = 0.5**refused
+            theta, values = evaluated(problem, run.theta, run.multipliers, updates, half)
+            if not int(values.code):
+                break
+        else:
+            why = f"steps were halved {_HALVINGS} times, and still {ILL[int(values.code)]}"
+            return run, shape, f"{why}: the last good shape is kept"
+        still, why = _same(run.theta, theta), ""
+        run = run._replace(
+            step=run.step + 1, theta=theta, state=state, values=values, since=run.since + 1
+        )
+        renewed = bool(values.worn) and search is not None
+        if renewed:
+            try:
+                shape = _renewed(shape, theta, search)
+            except ValueError as error:
+                renewed, why = False, f"neighbours could not be found anew: {error}"
+            run = run._replace(lists=eqx.filter(shape, eqx.is_array))
+        small = float(values.size) <= float(run.goal) * float(run.first)
+        corrected = bool(self.equalities or self.inequalities) and (
+            still or small or int(run.since) >= _INNER
+        )
+        if corrected:
+            run = self.corrected(run)
+        if renewed or corrected:
+            run = _seen_again(self.problem(shape), run)
+        elif still:
+            why = why or "no step along the search lowers the objective"
+        if int(run.stalls) >= _STALLS:
+            why = (
+                f"constraints are not met: a violation of {float(run.violation):.3g} has stayed "
+                f"while the penalty grew to {float(run.multipliers.penalty):.3g}; they may "
+                "contradict each other, or what the shape can do"
+            )
+        _note(run, refused=refused, renewed=renewed)
+        return run, shape, why
+
+    def corrected(self, run: _Run) -> _Run:
+        """With forces that the constraints were met with, and the penalty that this asks for."""
+        now, last = float(run.values.violation), float(run.violation)
+        multipliers = run.values.forced
+        wrong = now > self.numbers["ctol"]
+        if wrong and now > _FALLS * last:
+            multipliers = multipliers._replace(penalty=_GROWTH * multipliers.penalty)
+        stalls = run.stalls + 1 if wrong and now > _STAYS * last else np.array(0)
+        goal = np.maximum(self.numbers["rtol"], _GOAL * run.goal)
+        return run._replace(
+            multipliers=multipliers, violation=np.array(now), stalls=stalls, goal=goal,
+            since=np.array(0),
+        )  # fmt: skip
+
+    def ended(self, run: _Run) -> str:
+        """Why it ends here, if it does."""
+        small = float(run.values.size) <= self.numbers["rtol"] * float(run.first)
+        if small and float(run.values.violation) <= self.numbers["ctol"]:
+            return "converged"
+        steps = self.numbers["steps"]
+        return f"all {steps} steps used" if int(run.step) >= steps else ""
+
+    def found(self, run: _Run, shape, stopped: str) -> ShapeOptimization:
+        rows = {name: values[: int(run.step) + 1].copy() for name, values in run.history.items()}
+        v, forces = run.values, run.multipliers.equalities | run.multipliers.inequalities
+        return ShapeOptimization(
+            run.theta, shape, v.objective, v.equalities, v.inequalities, forces, rows,
+            stopped == "converged", stopped or "under way",
+        )  # fmt: skip
+
+
+def _is_only_far(surface: Discretization) -> bool:
+    """Whether nothing is wrong with a surface but its lists."""
+    try:
+        return set(np.asarray(surface.code).tolist()) <= {0, FAR}
+    except ValueError:  # it has no operators
+        return False
+
+
+def _renewed(shape: AbstractShape, theta, search: NeighborSearch) -> AbstractShape:
+    with warnings.catch_warnings():
+        # What bends within one stencil was told of the first surface.
+        warnings.simplefilter("ignore")
+        try:
+            return shape.renewed(theta, search)
+        except ValueError:  # there may be no room; the lists stay as wide
+            room = unchecked_surface(shape, theta).search(margin=2.0, slots=search.slots)
+            return shape.renewed(theta, room)
+
+
+def _seen_again(problem: Problem, run: _Run) -> _Run:
+    """After a change of what is minimised: value and gradient, also that which is remembered.
+
+    L-BFGS compares gradients at two places, which have to be those of one function.
+    """
+    _, values = evaluated(problem, run.theta, run.multipliers)
+    state = run.state
+    head = state[0] if isinstance(state, tuple) and state else None
+    if isinstance(head, optax.ScaleByLBFGSState):
+        _, past = evaluated(problem, head.params, run.multipliers)
+        state = (head._replace(updates=past.gradient), *state[1:])
+    return run._replace(values=values, state=state)
+
+
+def _note(run: _Run, **others) -> None:
+    """The row of a step."""
+    v, row = run.values, int(run.step)
+    known = dict(objective=v.objective, gradient=v.size, violation=v.violation)
+    known |= dict(penalty=run.multipliers.penalty) | others | v.equalities | v.inequalities
+    for name, value in known.items():
+        run.history[name][row] = np.asarray(value)
+
+
+def _same(a: PyTree, b: PyTree) -> bool:
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b))
+    return all(bool(np.array_equal(x, y)) for x, y in pairs)

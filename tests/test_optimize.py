@@ -1,0 +1,219 @@
+"""Shapes that minimise: constraints, folds, numbers that are none, restarts."""
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import jaxsurf as js
+
+from .helpers import count_compilations
+
+pytestmark = pytest.mark.slow
+
+METHOD = js.GFDM(degree=2)
+LBFGS, ADAM = optax.lbfgs(), optax.adam(0.05)
+
+
+@functools.cache
+def ball(n=200):
+    return js.discretize(js.sphere(n), method=METHOD)
+
+
+def scaled(x, axes):
+    return axes * x
+
+
+def stretched(x, logs):
+    return jnp.exp(logs) * x
+
+
+def rippled(x, size):
+    return x + size * jnp.sin(3 * x)
+
+
+def area(surface, volume):
+    return surface.areas.sum()
+
+
+def volume_left(surface, volume):
+    return js.volume(surface) / volume - 1
+
+
+def size(surface, *args):
+    """Mean square of the coordinates: a program that compiles quickly."""
+    return jnp.mean(surface.cloud.points**2, axis=0).sum()
+
+
+def axes_found(optimizer, start=(1.3, 1.0, 0.8), volume=4 * np.pi / 3, **options):
+    """Least area at fixed volume among ellipsoids."""
+    return js.optimize_shape(
+        area,
+        js.MappedShape(stretched, ball()),
+        jnp.log(jnp.asarray(start)),
+        optimizer=optimizer,
+        equalities={"volume": volume_left},
+        args=(jnp.asarray(volume),),
+        **options,
+    )
+
+
+def test_least_area_at_fixed_volume_is_a_ball_and_compiles_no_step():
+    """The multiplier is dA/dV times V = 2 V, with 200 points; another volume compiles nothing."""
+    seen = []
+    with count_compilations() as names:
+        found = axes_found(LBFGS, callback=lambda now: seen.append((len(names), now)))
+    assert found.converged and found.stopped == "converged"
+    np.testing.assert_allclose(found.theta, 0, atol=2e-3)
+    np.testing.assert_allclose(found.multipliers["volume"], -8 * np.pi / 3, rtol=5e-3)
+    assert abs(float(found.equalities["volume"])) < 1e-4
+    rows = found.history
+    assert rows["renewed"].sum() >= 1 and len(seen) == len(rows["seconds"]) - 1
+    assert np.isfinite(np.stack(list(rows.values()))).all()
+    assert rows["gradient"][-1] <= 1e-4 * rows["gradient"][0]
+    first = int(np.flatnonzero(rows["renewed"])[0])
+    assert seen[-1][0] == seen[first][0], "a program is compiled between steps"
+    with count_compilations() as names:
+        larger = axes_found(LBFGS, volume=2 * np.pi, start=(1.2, 1.0, 0.85))
+    assert not names, names
+    np.testing.assert_allclose(larger.theta, np.log(1.5) / 3, atol=2e-3)
+
+
+def test_neighbours_are_those_of_the_surface_that_is_reached():
+    """Stretched to twice its length and more, with the lists that `choose_neighbors` finds."""
+    target = jnp.array([2.2, 1.0, 0.8])
+    shape = js.MappedShape(scaled, ball())
+    apart = lambda surface: jnp.mean((surface.cloud.points - target * ball().cloud.points) ** 2)
+    found = js.optimize_shape(apart, shape, jnp.ones(3), optimizer=optax.sgd(1.0), rtol=1e-6)
+    assert found.converged and found.history["renewed"].sum() >= 2
+    np.testing.assert_allclose(found.theta, target, atol=1e-4)
+    rows = lambda surface: [
+        set(row) for row in np.asarray(surface.neighbors.indices)[:, :20].tolist()
+    ]
+    wanted = rows(js.discretize(found.surface.cloud, method=METHOD))
+    shared = lambda surface: np.mean([len(a & b) / 20 for a, b in zip(rows(surface), wanted)])
+    assert shared(found.surface) > 0.9 and shared(ball()) < 0.8
+
+
+def test_steps_that_fold_are_halved_and_the_last_good_shape_is_kept():
+    """x + a sin 3x is one to one for a < 1/3; the objective falls beyond."""
+    shape = js.MappedShape(rippled, ball())
+    run = lambda **options: js.optimize_shape(
+        lambda surface: -size(surface), shape, jnp.array(0.1), optimizer=optax.sgd(0.5), **options
+    )
+    with pytest.raises(
+        js.OptimizationError, match="halved 12 times, and still the surface folds"
+    ) as e:
+        run()
+    found = e.value.solution
+    assert found.history["refused"].max() > 0 and not found.converged
+    assert 0.25 < float(found.theta) < 0.4
+    assert not np.asarray(found.surface.code).any()
+    assert "folds" in repr(run(throw=False))
+
+
+def test_inequalities_hold_and_press():
+    """The smallest ball of radius 1.2 at least: nu = d(3 a²/3)/da over that of the constraint."""
+    shape = js.MappedShape(scaled, ball())
+    bound = {"radius": lambda surface: 1.44 - size(surface)}
+    idle = {"far": lambda surface: size(surface) - 9}
+    start = jnp.array([1.5, 1.5, 1.5])
+    found = js.optimize_shape(size, shape, start, optimizer=LBFGS, inequalities=bound | idle)
+    assert found.converged
+    np.testing.assert_allclose(size(found.surface), 1.44, atol=1e-4)
+    np.testing.assert_allclose(found.multipliers["radius"], 1, atol=1e-3)
+    assert float(found.multipliers["far"]) == 0
+
+
+def test_constraints_that_contradict_each_other_are_told():
+    shape = js.MappedShape(scaled, ball())
+    both = {"one": lambda surface: size(surface) - 1, "two": lambda surface: size(surface) - 2}
+    with pytest.raises(js.OptimizationError, match="may contradict each other") as e:
+        js.optimize_shape(size, shape, jnp.ones(3), optimizer=LBFGS, equalities=both, steps=300)
+    assert 1 < float(size(e.value.solution.surface)) < 2
+
+
+def test_a_run_that_goes_on_from_its_file_ends_in_the_same_bits(tmp_path):
+    whole = axes_found(ADAM, steps=12)
+    parts = js.Checkpoint(tmp_path / "run.npz", every=5)
+
+    def interrupt(now):
+        if len(now.history["seconds"]) == 9:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        axes_found(ADAM, steps=12, checkpoint=parts, callback=interrupt)
+    lengths = []
+    again = axes_found(
+        ADAM,
+        steps=12,
+        checkpoint=parts,
+        callback=lambda now: lengths.append(len(now.history["seconds"])),
+    )
+    assert lengths == list(range(7, 14))
+    assert np.array_equal(again.theta, whole.theta)
+    for name in set(whole.history) - {"seconds"}:
+        np.testing.assert_array_equal(again.history[name], whole.history[name])
+    with pytest.raises(ValueError, match="another run"):
+        axes_found(ADAM, steps=13, checkpoint=parts)
+
+
+def test_numbers_that_are_none():
+    """At the start an error that names what it is; later, steps that are halved."""
+    shape = js.MappedShape(scaled, ball())
+    root = lambda surface: jnp.where(size(surface) > 1, size(surface), jnp.nan)
+    with pytest.raises(ValueError, match="objective is nan at the first theta"):
+        js.optimize_shape(root, shape, 0.5 * jnp.ones(3), optimizer=LBFGS)
+    found = js.optimize_shape(root, shape, 1.1 * jnp.ones(3), optimizer=optax.sgd(0.3), throw=False)
+    assert "not finite" in found.stopped and np.isfinite(found.objective)
+    assert 1 <= float(size(found.surface)) < 1.05
+
+
+def test_free_form_keeps_its_parameters_where_the_reference_is_another():
+    """Displacements are sums along the way; the reference is where neighbours were found last."""
+    shape = js.NormalShape(ball())
+    target = 1.0 + 0.8 * ball().cloud.points[:, 2]
+    bulge = lambda surface: jnp.sum(
+        (surface.cloud.points[:, 2] - 2 * ball().cloud.points[:, 2]) ** 2
+    )
+    found = js.optimize_shape(
+        bulge, shape, jnp.zeros(200), optimizer=optax.sgd(0.2), steps=30, throw=False
+    )
+    assert found.history["renewed"].sum() >= 1 and target.shape == found.theta.shape
+    assert found.history["objective"][-1] < 0.1 * found.history["objective"][0]
+    apart = found.surface.cloud.points - found.shape.surface.cloud.points
+    along = jnp.sum(apart * found.shape.surface.cloud.normals, axis=1)
+    np.testing.assert_allclose(along, found.theta - found.shape.start, atol=1e-12)
+
+
+def test_level_sets_are_spread_evenly_again():
+    phi = lambda x, axes: jnp.sum((x / axes) ** 2) - 1
+    shape = js.LevelSetShape(phi, ball())
+    axes = jnp.array([1.4, 1.0, 1.0])
+    before = shape(axes)
+    after = shape.renewed(axes, before.search())(axes)
+
+    def closest(surface):
+        x = np.asarray(surface.cloud.points)
+        apart = np.linalg.norm(
+            x[np.asarray(surface.neighbors.indices)[:, 1:7]] - x[:, None], axis=2
+        )
+        return apart.min(axis=1)
+
+    assert closest(after).min() > 1.1 * closest(before).min()
+    assert float(jnp.abs(jnp.sum((after.cloud.points / axes) ** 2, axis=1) - 1).max()) < 1e-12
+
+
+def test_single_precision():
+    cloud = js.PointCloud(
+        ball().cloud.points.astype(jnp.float32), ball().cloud.normals.astype(jnp.float32)
+    )
+    shape = js.MappedShape(scaled, js.discretize(cloud, ball().neighbors, method=METHOD))
+    apart = lambda surface: (size(surface) - 1.44) ** 2
+    start = jnp.ones((), jnp.float32)
+    found = js.optimize_shape(apart, shape, start, optimizer=LBFGS, rtol=1e-3)
+    assert found.converged and found.theta.dtype == jnp.float32
+    np.testing.assert_allclose(found.theta, 1.2, atol=1e-3)
+    assert "steps" in repr(found) and "converged" in repr(found)

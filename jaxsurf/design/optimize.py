@@ -365,8 +365,8 @@ def _renewed(shape: AbstractShape, theta, search: NeighborSearch) -> AbstractSha
         warnings.simplefilter("ignore")
         try:
             return shape.renewed(theta, search)
-        except ValueError:  # there may be no room; the lists stay as wide
-            room = unchecked_surface(shape, theta).search(margin=2.0, slots=search.slots)
+        except ValueError:  # there may be no room
+            room = unchecked_surface(shape, theta).search(margin=2.0)
             return shape.renewed(theta, room)
 
 

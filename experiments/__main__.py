@@ -47,6 +47,15 @@ EXPERIMENTS = {
         "e08_bump",
         "Diffusion over a bump against fine surface finite elements (paper 001, Figs. 5, 6)",
     ),
+    "E9": ("e09_rotation", "A quarter of a sphere turns once, three moves (paper 002, Fig. 5)"),
+    "E13": (
+        "e13_expanding_sphere",
+        "Heat with a source on the expanding sphere, errors of space (paper 002, Table 2)",
+    ),
+    "E18": (
+        "e18_expanding_wave",
+        "Waves with a source on the expanding sphere, errors of space (paper 002, Table 4)",
+    ),
     "accuracy": (
         "accuracy",
         "Study: error of the Laplacian on the unit sphere, with defaults, beside other codes",

@@ -77,6 +77,10 @@ EXPERIMENTS = {
         "Study: Poisson on ellipsoid, torus and a surface of genus 2; scans; orders and steps",
     ),
     "integrals": ("integrals", "Study: area, volume and integrals of curvature, by order"),
+    "sphere-flow": (
+        "sphere_flow",
+        "Mean curvature flow of the sphere until r = 0.3, against sqrt(1 - 2t)",
+    ),
     "slopes": ("slopes", "Study: observed orders of the Laplacian on sphere, ellipsoid and torus"),
     "stability": (
         "stability",

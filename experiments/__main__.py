@@ -47,6 +47,15 @@ EXPERIMENTS = {
         "e08_bump",
         "Diffusion over a bump against fine surface finite elements (paper 001, Figs. 5, 6)",
     ),
+    "E9": ("e09_rotation", "A quarter of a sphere turns once, three moves (paper 002, Fig. 5)"),
+    "E13": (
+        "e13_expanding_sphere",
+        "Heat with a source on the expanding sphere, errors of space (paper 002, Table 2)",
+    ),
+    "E18": (
+        "e18_expanding_wave",
+        "Waves with a source on the expanding sphere, errors of space (paper 002, Table 4)",
+    ),
     "accuracy": (
         "accuracy",
         "Study: error of the Laplacian on the unit sphere, with defaults, beside other codes",
@@ -76,6 +85,10 @@ EXPERIMENTS = {
         "Shapes: from a bumpy star to the sphere, by least area at fixed volume",
     ),
     "integrals": ("integrals", "Study: area, volume and integrals of curvature, by order"),
+    "sphere-flow": (
+        "sphere_flow",
+        "Mean curvature flow of the sphere until r = 0.3, against sqrt(1 - 2t)",
+    ),
     "slopes": ("slopes", "Study: observed orders of the Laplacian on sphere, ellipsoid and torus"),
     "stability": (
         "stability",

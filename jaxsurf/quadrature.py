@@ -24,11 +24,12 @@ from .build import blocks_of, determined, neighborhood, rows_of
 from .cloud import PointCloud
 from .compiling import sized_jit
 from .failures import is_concrete, refuse
+from .fits.graph import Graph, polynomial
 from .fits.moments import blockwise, in_blocks, moment_solve
-from .fits.monomials import differentiation, monomials_by_degree, polynomial_count
+from .fits.monomials import monomials_by_degree, polynomial_count
 from .fits.plane import TangentPlane
 from .neighbors import Neighbors
-from .stencils.method import with_center
+from .stencils.method import AbstractMethod, with_center
 
 _BATCH = 128
 # Newton steps from cells with straight sides to those on the surface: each squares what is left of
@@ -40,6 +41,20 @@ _CELLS = 24
 _SIDES = 16
 
 
+def cells_of(cloud: PointCloud, neighbors: Neighbors, method: AbstractMethod, border):
+    """Arguments of `areas` and `cell_areas`, looked at."""
+    degree = method.polynomial_degree
+    need = polynomial_count(cloud.dim - 1, degree)
+    if neighbors.k < need:
+        raise ValueError(
+            f"k = {neighbors.k} neighbours, polynomials of degree {degree} need at least {need}"
+        )
+    if border is None:
+        return cloud, neighbors, degree, None
+    outward = jnp.zeros_like(cloud.points).at[border.points].set(border.conormals(cloud))
+    return cloud, neighbors, degree, outward
+
+
 def areas(
     cloud: PointCloud,
     neighbors: Neighbors,
@@ -47,16 +62,31 @@ def areas(
     outward: Float[Array, "n d"] | None,
 ) -> Float[Array, " n"]:
     """Weights of the points in integrals over the surface; arguments as of `cell_weights`."""
+    weights, residual = _closed(cell_weights, cloud, neighbors, degree, outward)
+    return _summed(determined(weights, residual, degree), neighbors.indices.T)
+
+
+def cell_areas(
+    cloud: PointCloud,
+    neighbors: Neighbors,
+    degree: int,
+    outward: Float[Array, "n d"] | None,
+) -> Float[Array, " n"]:
+    """Areas of the cells themselves; arguments as of `cell_weights`."""
+    return _closed(_cell_sizes, cloud, neighbors, degree, outward)[0]
+
+
+def _closed(measure, cloud, neighbors, degree, outward):
+    """What is measured of cells, those refused that are not closed."""
     args = (cloud, neighbors, degree)
-    weights, closed, residual = cell_weights(*args, _CELLS, outward)
+    values, closed, more = measure(*args, _CELLS, outward)
     if is_concrete(closed) and not closed.all():
-        weights, closed, residual = cell_weights(*args, neighbors.k, outward)
+        values, closed, more = measure(*args, neighbors.k, outward)
     text = (
         "the neighbours of point {i} do not close its cell, out of {v} of them: mark the "
         "border of the surface (`boundary`), or choose more neighbours"
     )
-    weights = refuse(weights, ~closed, text, jnp.sum(neighbors.mask, axis=1))
-    return _summed(determined(weights, residual, degree), neighbors.indices.T)
+    return refuse(values, ~closed, text, jnp.sum(neighbors.mask, axis=1)), more
 
 
 @jax.jit
@@ -82,6 +112,23 @@ def cell_weights(
         Weights `(k, n)`; whether each cell is bounded by neighbours so near that no other
         point can have a part of it; the relative moment residual of its weights.
     """
+    planes, mask, moments, closed = _cells(cloud, neighbors, degree, cells, outward)
+    weights, residual = _weights_of_blocks(planes, mask, moments, degree)
+    weights, (closed, residual) = rows_of(weights, (closed, residual), cloud.n)
+    on = neighbors.mask[:, 0]
+    return weights, closed | ~on, jnp.where(on, residual, 0)
+
+
+def _cell_sizes(cloud, neighbors, degree, cells, outward):
+    planes, _, moments, closed = _cells(cloud, neighbors, degree, cells, outward)
+    sizes = planes.width ** planes.points.shape[1] * moments[:, 0]
+    _, (sizes, closed) = rows_of(moments, (sizes, closed), cloud.n)
+    on = neighbors.mask[:, 0]
+    return jnp.where(on, sizes, 0), closed | ~on, None
+
+
+def _cells(cloud, neighbors, degree, cells, outward):
+    """Planes, masks and moments of all cells in blocks, and whether they are closed."""
     blocks = blocks_of(cloud, neighbors, np.arange(cloud.n, dtype=np.int32), _BATCH)
     lines = None if outward is None else in_blocks(outward.T, _BATCH)
     mask, cells = blocks[2], min(cells, neighbors.k)
@@ -89,11 +136,7 @@ def cell_weights(
     # derivative took fifteen times as long as the value.
     planes, graphs = _surfaces(blocks, degree)
     ways = _ways_of_blocks(*jax.lax.stop_gradient((planes, mask, lines)), cells)
-    moments, closed = _moments_of_blocks(planes, graphs, mask, lines, ways, cells)
-    weights, residual = _weights_of_blocks(planes, mask, moments, degree)
-    weights, (closed, residual) = rows_of(weights, (closed, residual), cloud.n)
-    on = neighbors.mask[:, 0]
-    return weights, closed | ~on, jnp.where(on, residual, 0)
+    return planes, mask, *_moments_of_blocks(planes, graphs, mask, lines, ways, cells)
 
 
 @sized_jit
@@ -139,52 +182,6 @@ def _weights_of_blocks(planes, mask, moments, degree: int):
         return jnp.where(mask, eta, 0), residual
 
     return blockwise(weights, (planes, mask, moments))
-
-
-class Graph(eqx.Module):
-    """The surface as a polynomial over the tangent plane.
-
-    Args:
-        coefficients: of degree 1 to `degree`.
-    """
-
-    coefficients: Float[Array, "m *p"]
-    degree: int = eqx.field(static=True)
-    dim: int = eqx.field(static=True)
-
-    @property
-    def slopes(self) -> list[list[Array]]:
-        """Coefficients of the derivatives along the axes, by degree from 0 to `degree` - 1."""
-        matrices = differentiation(self.dim, self.degree)[:, :, 1:]
-        return [
-            [_places(matrix[part], self.coefficients) for part in self.parts[:-1]]
-            for matrix in matrices
-        ]
-
-    @property
-    def parts(self) -> list[slice]:
-        """Which of all monomials are of each degree."""
-        last = [polynomial_count(self.dim, g) for g in range(self.degree + 1)]
-        return [slice(start, stop) for start, stop in zip([0, *last], last)]
-
-    def at(self, q):
-        """Heights and slopes."""
-        rows = monomials_by_degree(q, self.degree)
-        own = [self.coefficients[part.start - 1 : part.stop - 1] for part in self.parts[1:]]
-        slopes = jnp.stack([_polynomial(c, rows) for c in self.slopes])
-        return _polynomial(own, rows[1:]), slopes
-
-
-def _polynomial(coefficients: list[Array], rows: list[Array]):
-    """Sum over all degrees, kept apart: to put slices together again takes longer than all else."""
-    parts = [jnp.sum(c[:, None] * row, axis=0) for c, row in zip(coefficients, rows)]
-    return functools.reduce(jnp.add, parts)
-
-
-def _places(matrix: np.ndarray, a):
-    """A matrix with one entry in a row times a vector over the basis."""
-    power = matrix.max(axis=1).reshape(-1, *(1,) * (a.ndim - 1)).astype(a.dtype)
-    return a[matrix.argmax(axis=1)] * power
 
 
 class Sides(eqx.Module):
@@ -289,7 +286,7 @@ def _along_ways(sides: Sides, graph: Graph, ends, measure):
     powers = at ** np.arange(degree + 1)[:, None].astype(length.dtype)
     square = jnp.ones((nodes, *length.shape), length.dtype)
     for slope in graph.slopes:
-        along = jnp.stack([_polynomial([c], [row]) for c, row in zip(slope, rows)])
+        along = jnp.stack([polynomial([c], [row]) for c, row in zip(slope, rows)])
         square = square + jnp.tensordot(powers[:-1].T, along, 1) ** 2
     sums = jnp.tensordot(powers * share, jnp.sqrt(square), 1) * measure
     found = [jnp.sum(row * total, axis=1) for row, total in zip(rows, sums)]

@@ -184,7 +184,8 @@ class Discretization(eqx.Module):
         r"""Areas of the cells themselves, `(n,)`: positive, with the sum of `areas`.
 
         The masses of `symmetric_laplacian`. As weights of integrals of second order only, since
-        the middle of a cell is not its point. Differentiable and refused as `areas`.
+        the middle of a cell is not its point. Where neighbours do not close a cell, the mean of
+        theirs, with a warning. Differentiable as `areas`.
         """
         return quadrature.cell_areas(*self._bounds)
 

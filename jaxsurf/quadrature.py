@@ -11,6 +11,7 @@ all neighbours, exactly as those of a derivative come from its values on monomia
 from __future__ import annotations
 
 import functools
+import warnings
 from collections.abc import Callable
 
 import equinox as eqx
@@ -62,7 +63,15 @@ def areas(
     outward: Float[Array, "n d"] | None,
 ) -> Float[Array, " n"]:
     """Weights of the points in integrals over the surface; arguments as of `cell_weights`."""
-    weights, residual = _closed(cell_weights, cloud, neighbors, degree, outward)
+    args = (cloud, neighbors, degree)
+    weights, closed, residual = cell_weights(*args, _CELLS, outward)
+    if is_concrete(closed) and not closed.all():
+        weights, closed, residual = cell_weights(*args, neighbors.k, outward)
+    text = (
+        "the neighbours of point {i} do not close its cell, out of {v} of them: mark the "
+        "border of the surface (`boundary`), or choose more neighbours"
+    )
+    weights = refuse(weights, ~closed, text, jnp.sum(neighbors.mask, axis=1))
     return _summed(determined(weights, residual, degree), neighbors.indices.T)
 
 
@@ -72,21 +81,28 @@ def cell_areas(
     degree: int,
     outward: Float[Array, "n d"] | None,
 ) -> Float[Array, " n"]:
-    """Areas of the cells themselves; arguments as of `cell_weights`."""
-    return _closed(_cell_sizes, cloud, neighbors, degree, outward)[0]
+    """Areas of the cells themselves, arguments as of `cell_weights`.
 
-
-def _closed(measure, cloud, neighbors, degree, outward):
-    """What is measured of cells, those refused that are not closed."""
+    Where neighbours do not close a cell, as at folds of a scan, the mean of theirs, with a warning.
+    """
     args = (cloud, neighbors, degree)
-    values, closed, more = measure(*args, _CELLS, outward)
+    sizes, closed, _ = _cell_sizes(*args, _CELLS, outward)
     if is_concrete(closed) and not closed.all():
-        values, closed, more = measure(*args, neighbors.k, outward)
-    text = (
-        "the neighbours of point {i} do not close its cell, out of {v} of them: mark the "
-        "border of the surface (`boundary`), or choose more neighbours"
-    )
-    return refuse(values, ~closed, text, jnp.sum(neighbors.mask, axis=1)), more
+        sizes, closed, _ = _cell_sizes(*args, neighbors.k, outward)
+        if not closed.all():
+            warnings.warn(
+                f"the cells of {int((~closed).sum())} points, the first {int(jnp.argmin(closed))}, "
+                "are not closed by their neighbours and are given the mean area of theirs: is a "
+                "border not marked?",
+                stacklevel=4,
+            )
+    good = closed & (sizes > 0)
+    counted = neighbors.mask & good[neighbors.indices]
+    total = jnp.sum(jnp.where(counted, sizes[neighbors.indices], 0), axis=1)
+    mean = total / jnp.maximum(jnp.sum(counted, axis=1), 1)
+    on = neighbors.mask[:, 0]
+    sizes = jnp.where(good | ~on, sizes, mean)
+    return refuse(sizes, on & ~(sizes > 0), "the cell of point {i} has the area {v}", sizes)
 
 
 @jax.jit

@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
@@ -123,11 +124,11 @@ def _on_scan(name: str, cloud: js.PointCloud, t1: float) -> list[Row]:
         return masses @ (v**2 - u * scaled(u)) / 2
 
     setting = {"points": name, "n": cloud.n, "t": t1}
-    times = jnp.linspace(0, t1, 11)
-    waves = js.integrate(js.WaveEquation(scaled), (bell, 0 * bell), t1=t1, ts=times, rtol=1e-6)
+    save = {"t1": t1, "saveat": dfx.SaveAt(ts=jnp.linspace(0, t1, 11))}
+    waves = js.integrate(js.WaveEquation(scaled), (bell, 0 * bell), rtol=1e-6, **save)
     energies = np.array([energy(u, v) for u, v in zip(*waves.ys)])
     noise = jnp.asarray(np.random.default_rng(0).normal(size=cloud.n))
-    heat = js.integrate(js.AdvectionDiffusionReaction(scaled), noise, t1=t1, ts=times).ys
+    heat = js.integrate(js.AdvectionDiffusionReaction(scaled), noise, **save).ys
     norms, mass = np.asarray(heat**2 @ masses), np.asarray(heat @ masses)
     residual = operator.diagnostics.residual
     return [

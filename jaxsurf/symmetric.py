@@ -178,7 +178,9 @@ def symmetrised(
     weights, left = positive_weights(cloud, neighbors, masses, flux)
     weights = (weights / jnp.where(masses > 0, masses, 1))[None]
     operator = laplacian.of_weights(with_center(weights)[0])
-    return eqx.tree_at(lambda o: o.diagnostics.residual, operator, left)
+    # No border: the condition there is part of it.
+    parts, none = lambda o: (o.diagnostics.residual, o.border), lambda x: x is None
+    return eqx.tree_at(parts, operator, (left, None), is_leaf=none)
 
 
 @sized_jit

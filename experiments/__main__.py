@@ -94,6 +94,10 @@ EXPERIMENTS = {
         "stability",
         "Study: spectra of the default Laplacians, also on random points and the bunny",
     ),
+    "symmetric": (
+        "symmetric",
+        "Symmetric semi-definite Laplacians: three ways compared; heat and waves on scans",
+    ),
     "transport": (
         "transport",
         "Transport: solid-body rotation on the sphere, order after one turn, growth in 100",

@@ -16,7 +16,6 @@ from .build import build, choose_neighbors
 from .cloud import PointCloud
 from .compiling import copying_jit
 from .failures import is_concrete, needs_values, raise_at
-from .fits.monomials import polynomial_count
 from .interpolation import interpolated
 from .kept import Kept
 from .motion import CODES, folded, judged, moved_cloud, unreached
@@ -27,6 +26,7 @@ from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil
 from .stencils.targets import Gradient, Joint, Laplacian
+from .symmetric import symmetrised
 
 
 class Discretization(eqx.Module):
@@ -102,6 +102,31 @@ class Discretization(eqx.Module):
         )
 
     @Kept
+    def symmetric_laplacian(self) -> Stencil:
+        r"""A Laplacian that is symmetric and negative semi-definite in the inner product of masses.
+
+        With `cell_areas` m: $m_i w_{ij} = m_j w_{ji} > 0$, $j \ne i$, and rows that sum to zero, on
+        any cloud and to round-off. See `jaxsurf/symmetric.py`. At a border it has the natural
+        condition $\partial_\nu u = 0$. `diagnostics.residual`: how far the moments of its rows
+        are from those of the Laplacian, relative to these.
+
+        Accuracy: solutions of second order on quasi-uniform points (`tests/test_symmetric.py`);
+            $L u$ itself is not, see `python -m experiments run symmetric`. Symmetric to round-off
+            in single precision too.
+        Differentiable: forward and reverse, in points and normals, for fixed neighbours.
+        Raises:
+            ValueError: as `areas` and `laplacian`.
+
+        Example:
+            >>> surface = js.discretize(js.sphere(300), method=js.GFDM(degree=2))
+            >>> m, u = surface.cell_areas, surface.cloud.points[:, 0] ** 3
+            >>> operator = surface.symmetric_laplacian
+            >>> bool(abs(m @ operator(u)) < 1e-12), bool(m @ (u * operator(u)) < 0)
+            (True, True)
+        """
+        return symmetrised(self.laplacian, self.cloud, self.neighbors, self.cell_areas, self.border)
+
+    @Kept
     def _joint(self) -> tuple[Stencil, Stencil]:
         """Laplacian and gradient from one factorisation of the moment matrices."""
         both = self._build(Joint((Laplacian(), Gradient())))
@@ -160,18 +185,21 @@ class Discretization(eqx.Module):
             ValueError: the cell of a point is not closed by its neighbours (named by index), as
                 on a border that is not marked.
         """
-        degree = self.method.polynomial_degree
-        need = polynomial_count(self.cloud.dim - 1, degree)
-        if self.neighbors.k < need:
-            raise ValueError(
-                f"k = {self.neighbors.k} neighbours, polynomials of degree {degree} need at least "
-                f"{need}"
-            )
-        outward = None
-        if self.border is not None:
-            conormals = self.border.conormals(self.cloud)
-            outward = jnp.zeros_like(self.cloud.points).at[self.border.points].set(conormals)
-        return quadrature.areas(self.cloud, self.neighbors, degree, outward)
+        return quadrature.areas(*self._bounds)
+
+    @Kept
+    def cell_areas(self) -> Float[Array, " n"]:
+        r"""Areas of the cells themselves, `(n,)`: positive, with the sum of `areas`.
+
+        The masses of `symmetric_laplacian`. As weights of integrals of second order only, since
+        the middle of a cell is not its point. Where neighbours do not close a cell, the mean of
+        theirs, with a warning. Differentiable as `areas`.
+        """
+        return quadrature.cell_areas(*self._bounds)
+
+    @property
+    def _bounds(self):
+        return quadrature.cells_of(self.cloud, self.neighbors, self.method, self.border)
 
     def integrate(self, u: Float[Array, "n *c"]) -> Float[Array, "*c"]:
         r"""$\int_S u\,dS$ of a field or of each of its components."""

@@ -11,6 +11,7 @@ all neighbours, exactly as those of a derivative come from its values on monomia
 from __future__ import annotations
 
 import functools
+import warnings
 from collections.abc import Callable
 
 import equinox as eqx
@@ -24,11 +25,12 @@ from .build import blocks_of, determined, neighborhood, rows_of
 from .cloud import PointCloud
 from .compiling import sized_jit
 from .failures import is_concrete, refuse
+from .fits.graph import Graph, polynomial
 from .fits.moments import blockwise, in_blocks, moment_solve
-from .fits.monomials import differentiation, monomials_by_degree, polynomial_count
+from .fits.monomials import monomials_by_degree, polynomial_count
 from .fits.plane import TangentPlane
 from .neighbors import Neighbors
-from .stencils.method import with_center
+from .stencils.method import AbstractMethod, with_center
 
 _BATCH = 128
 # Newton steps from cells with straight sides to those on the surface: each squares what is left of
@@ -38,6 +40,20 @@ _STEPS = 2
 _CELLS = 24
 # Of these so many are its sides at most, or half of those that are tried.
 _SIDES = 16
+
+
+def cells_of(cloud: PointCloud, neighbors: Neighbors, method: AbstractMethod, border):
+    """Arguments of `areas` and `cell_areas`, looked at."""
+    degree = method.polynomial_degree
+    need = polynomial_count(cloud.dim - 1, degree)
+    if neighbors.k < need:
+        raise ValueError(
+            f"k = {neighbors.k} neighbours, polynomials of degree {degree} need at least {need}"
+        )
+    if border is None:
+        return cloud, neighbors, degree, None
+    outward = jnp.zeros_like(cloud.points).at[border.points].set(border.conormals(cloud))
+    return cloud, neighbors, degree, outward
 
 
 def areas(
@@ -57,6 +73,36 @@ def areas(
     )
     weights = refuse(weights, ~closed, text, jnp.sum(neighbors.mask, axis=1))
     return _summed(determined(weights, residual, degree), neighbors.indices.T)
+
+
+def cell_areas(
+    cloud: PointCloud,
+    neighbors: Neighbors,
+    degree: int,
+    outward: Float[Array, "n d"] | None,
+) -> Float[Array, " n"]:
+    """Areas of the cells themselves, arguments as of `cell_weights`.
+
+    Where neighbours do not close a cell, as at folds of a scan, the mean of theirs, with a warning.
+    """
+    args = (cloud, neighbors, degree)
+    sizes, closed, _ = _cell_sizes(*args, _CELLS, outward)
+    if is_concrete(closed) and not closed.all():
+        sizes, closed, _ = _cell_sizes(*args, neighbors.k, outward)
+        if not closed.all():
+            warnings.warn(
+                f"the cells of {int((~closed).sum())} points, the first {int(jnp.argmin(closed))}, "
+                "are not closed by their neighbours and are given the mean area of theirs: is a "
+                "border not marked?",
+                stacklevel=4,
+            )
+    good = closed & (sizes > 0)
+    counted = neighbors.mask & good[neighbors.indices]
+    total = jnp.sum(jnp.where(counted, sizes[neighbors.indices], 0), axis=1)
+    mean = total / jnp.maximum(jnp.sum(counted, axis=1), 1)
+    on = neighbors.mask[:, 0]
+    sizes = jnp.where(good | ~on, sizes, mean)
+    return refuse(sizes, on & ~(sizes > 0), "the cell of point {i} has the area {v}", sizes)
 
 
 @jax.jit
@@ -82,6 +128,23 @@ def cell_weights(
         Weights `(k, n)`; whether each cell is bounded by neighbours so near that no other
         point can have a part of it; the relative moment residual of its weights.
     """
+    planes, mask, moments, closed = _cells(cloud, neighbors, degree, cells, outward)
+    weights, residual = _weights_of_blocks(planes, mask, moments, degree)
+    weights, (closed, residual) = rows_of(weights, (closed, residual), cloud.n)
+    on = neighbors.mask[:, 0]
+    return weights, closed | ~on, jnp.where(on, residual, 0)
+
+
+def _cell_sizes(cloud, neighbors, degree, cells, outward):
+    planes, _, moments, closed = _cells(cloud, neighbors, degree, cells, outward)
+    sizes = planes.width ** planes.points.shape[1] * moments[:, 0]
+    _, (sizes, closed) = rows_of(moments, (sizes, closed), cloud.n)
+    on = neighbors.mask[:, 0]
+    return jnp.where(on, sizes, 0), closed | ~on, None
+
+
+def _cells(cloud, neighbors, degree, cells, outward):
+    """Planes, masks and moments of all cells in blocks, and whether they are closed."""
     blocks = blocks_of(cloud, neighbors, np.arange(cloud.n, dtype=np.int32), _BATCH)
     lines = None if outward is None else in_blocks(outward.T, _BATCH)
     mask, cells = blocks[2], min(cells, neighbors.k)
@@ -89,11 +152,7 @@ def cell_weights(
     # derivative took fifteen times as long as the value.
     planes, graphs = _surfaces(blocks, degree)
     ways = _ways_of_blocks(*jax.lax.stop_gradient((planes, mask, lines)), cells)
-    moments, closed = _moments_of_blocks(planes, graphs, mask, lines, ways, cells)
-    weights, residual = _weights_of_blocks(planes, mask, moments, degree)
-    weights, (closed, residual) = rows_of(weights, (closed, residual), cloud.n)
-    on = neighbors.mask[:, 0]
-    return weights, closed | ~on, jnp.where(on, residual, 0)
+    return planes, mask, *_moments_of_blocks(planes, graphs, mask, lines, ways, cells)
 
 
 @sized_jit
@@ -139,52 +198,6 @@ def _weights_of_blocks(planes, mask, moments, degree: int):
         return jnp.where(mask, eta, 0), residual
 
     return blockwise(weights, (planes, mask, moments))
-
-
-class Graph(eqx.Module):
-    """The surface as a polynomial over the tangent plane.
-
-    Args:
-        coefficients: of degree 1 to `degree`.
-    """
-
-    coefficients: Float[Array, "m *p"]
-    degree: int = eqx.field(static=True)
-    dim: int = eqx.field(static=True)
-
-    @property
-    def slopes(self) -> list[list[Array]]:
-        """Coefficients of the derivatives along the axes, by degree from 0 to `degree` - 1."""
-        matrices = differentiation(self.dim, self.degree)[:, :, 1:]
-        return [
-            [_places(matrix[part], self.coefficients) for part in self.parts[:-1]]
-            for matrix in matrices
-        ]
-
-    @property
-    def parts(self) -> list[slice]:
-        """Which of all monomials are of each degree."""
-        last = [polynomial_count(self.dim, g) for g in range(self.degree + 1)]
-        return [slice(start, stop) for start, stop in zip([0, *last], last)]
-
-    def at(self, q):
-        """Heights and slopes."""
-        rows = monomials_by_degree(q, self.degree)
-        own = [self.coefficients[part.start - 1 : part.stop - 1] for part in self.parts[1:]]
-        slopes = jnp.stack([_polynomial(c, rows) for c in self.slopes])
-        return _polynomial(own, rows[1:]), slopes
-
-
-def _polynomial(coefficients: list[Array], rows: list[Array]):
-    """Sum over all degrees, kept apart: to put slices together again takes longer than all else."""
-    parts = [jnp.sum(c[:, None] * row, axis=0) for c, row in zip(coefficients, rows)]
-    return functools.reduce(jnp.add, parts)
-
-
-def _places(matrix: np.ndarray, a):
-    """A matrix with one entry in a row times a vector over the basis."""
-    power = matrix.max(axis=1).reshape(-1, *(1,) * (a.ndim - 1)).astype(a.dtype)
-    return a[matrix.argmax(axis=1)] * power
 
 
 class Sides(eqx.Module):
@@ -289,7 +302,7 @@ def _along_ways(sides: Sides, graph: Graph, ends, measure):
     powers = at ** np.arange(degree + 1)[:, None].astype(length.dtype)
     square = jnp.ones((nodes, *length.shape), length.dtype)
     for slope in graph.slopes:
-        along = jnp.stack([_polynomial([c], [row]) for c, row in zip(slope, rows)])
+        along = jnp.stack([polynomial([c], [row]) for c, row in zip(slope, rows)])
         square = square + jnp.tensordot(powers[:-1].T, along, 1) ** 2
     sums = jnp.tensordot(powers * share, jnp.sqrt(square), 1) * measure
     found = [jnp.sum(row * total, axis=1) for row, total in zip(rows, sums)]

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ..arguments import as_float, instance
+from ..arguments import instance
 from ..discretization import Discretization
 from ..stencils.algebra import AbstractOperator
 
@@ -71,9 +71,7 @@ class Motion(AbstractMotion):
         self.function = velocity
 
     def velocity(self, t, surface, fields, args):
-        points = surface.cloud.points
-        found = as_float(self.function(t, surface, fields, args), "velocity", points.shape)
-        return found.astype(points.dtype)
+        return self.function(t, surface, fields, args)
 
 
 class MeanCurvatureFlow(AbstractMotion):

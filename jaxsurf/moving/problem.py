@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from ..arguments import switched_off
+from ..arguments import as_float, switched_off
 from ..discretization import Discretization
 from ..functions import numbers_as_arrays
 from ..motion import carried
@@ -66,6 +66,8 @@ class Moving(AbstractEvolution):
         points, fields = parted(u)
         surface = self.surface_at(points)
         velocity = self.motion.velocity(t, surface, fields, args)
+        name = f"velocity of {type(self.motion).__name__}"
+        velocity = as_float(velocity, name, points.shape).astype(points.dtype)
         if self.on is None:
             return self._free(joined(velocity, jax.tree.map(jnp.zeros_like, fields)))
         problem = self.on(surface)

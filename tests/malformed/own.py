@@ -75,6 +75,17 @@ class Method(js.AbstractMethod):
         return self.change(js.GFDM(degree=2).weights(neighborhood, target))
 
 
+class Motion(js.AbstractMotion):
+    how: object = eqx.field(static=True)
+
+    def velocity(self, t, surface, fields, args):
+        return self.how(surface.cloud.points)
+
+
+def moved(how):
+    return js.evolve(Motion(how), js.sphere(80), t1=0.1, method=js.GFDM(degree=2))
+
+
 def solved(how):
     operator = 1 - parts()[1]
     return js.solve(operator, u0(), preconditioner=Preconditioner(False, how))
@@ -122,6 +133,10 @@ CASES = [
     Case("AbstractEvolution", "rest gives None", lambda: integrated(second=lambda u: None), ("rest of Problem", "None")),
     Case("AbstractEvolution", "linear gives a number", lambda: integrated(first=lambda u: 0.0), ("linear of Problem", "()", f"({N},)")),
     Case("AbstractEvolution", "linear gives two", lambda: integrated(first=lambda u: (u, u)), ("linear of Problem", "(*, *)")),
+    Case("AbstractMotion", "a number per point", lambda: moved(lambda x: x[:, 0]), ("velocity of Motion", "(80,)", "(80, 3)")),
+    Case("AbstractMotion", "no velocity", lambda: moved(lambda x: None), ("velocity of Motion", "None")),
+    Case("AbstractMotion", "complex velocity", lambda: moved(lambda x: 1j * x), ("velocity of Motion", "complex")),
+    Case("AbstractMotion", "text", lambda: moved(lambda x: "fast"), ("velocity of Motion",)),
     Case("AbstractMethod", "weights of too few slots", lambda: built(change=lambda found: (found[0][..., 1:, :], found[1])), ("weights of Method", "(6, 64)", "7, 64")),
     Case("AbstractMethod", "weights without diagnostics", lambda: built(change=lambda found: found[0]), ("weights of Method", "Diagnostics")),
     Case("AbstractMethod", "no neighbours", lambda: built(counts=(0, 3, 64)), ("neighbor_count", "0", "1")),

@@ -257,7 +257,7 @@ def test_a_run_that_was_killed_goes_on_bit_by_bit(kind, tmp_path, monkeypatch):
 
     import jaxsurf.time.checkpoint as module
 
-    write, count = module._write, 0
+    write, count = module.written, 0
 
     def write_and_die(*args):
         nonlocal count
@@ -266,7 +266,7 @@ def test_a_run_that_was_killed_goes_on_bit_by_bit(kind, tmp_path, monkeypatch):
         if count == 2:
             raise Stop
 
-    monkeypatch.setattr(module, "_write", write_and_die)
+    monkeypatch.setattr(module, "written", write_and_die)
     with pytest.raises(Stop):
         run("killed")
     monkeypatch.undo()

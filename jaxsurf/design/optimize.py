@@ -76,7 +76,7 @@ class _Run(NamedTuple):
 def optimize_shape(
     objective: Callable[..., Float[Array, ""]],
     shape: AbstractShape,
-    theta: PyTree[Float[Array, "..."]],
+    theta: PyTree[Float[Array, "..."] | float],
     *,
     optimizer: optax.GradientTransformation,
     equalities: Mapping[str, Callable] | None = None,

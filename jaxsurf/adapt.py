@@ -18,8 +18,8 @@ from .stencils.method import AbstractMethod
 from .stencils.targets import Laplacian
 
 # How many of the nearest points make up the neighbourhoods of such points, in units of the usual
-# number: tried in turn.
-_SIZES = (1.5, 2.25, 3.4, 0.67, 0.45)
+# number: tried in turn. Small steps, since farther points than needed cost accuracy.
+_SIZES = (1.1, 1.2, 1.35, 1.5, 1.85, 2.25, 2.8, 3.4, 0.67, 0.45)
 # A direction along which no regular arrangement of points is symmetric.
 _OBLIQUE = (0.6180, 0.3247, 0.7549)
 

@@ -48,7 +48,7 @@ def choose_neighbors(
     Every point gets the number k of neighbours that the method asks for. Where the
     Laplacian's weight of the centre is then positive or small,
     $-w_{ii} < 0.2 \sum_{j \ne i} |w_{ij}|$ (with RBF-FD only where it is positive), or its
-    conditions cannot be met, larger neighbourhoods are tried, by half, up to three times, of which
+    conditions cannot be met, larger neighbourhoods are tried, by a tenth to 3.4 times, of which
     k points that are spread evenly over them are taken; then smaller ones, which see less of a
     fold. The first that serves is taken; if none does, that with
     the most dominant centre, on a border the usual one: a one-sided Laplacian has no dominant
@@ -204,6 +204,8 @@ def _chosen(cloud, method, throw, needed):
     kept = [np.asarray(a)[..., rows] for a in (lists[0].T, lists[1].T, *jax.tree.leaves(found))]
     wanted = share_wanted(border, share, method)[rows]
     for size in sizes:
+        if (best >= method.least_dominance).all():
+            break
         some = represented(points, *wide, size, k)
         trial = _in_chunks(cloud, *some, method, rows)
         now = _dominance(*trial)

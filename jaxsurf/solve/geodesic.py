@@ -293,7 +293,14 @@ def _neighbors(cloud, method) -> Neighbors:
     offsets = np.where(mask, x[np.asarray(neighbors.indices)] - x[:, None], 0)
     total, square = offsets.sum(axis=1), (offsets**2).sum(axis=(1, 2))
     one_sided = (total**2).sum(axis=1) > _ONE_SIDED**2 * mask.sum(axis=(1, 2)) * square
-    return choose_neighbors(cloud, method=method) if one_sided.any() else neighbors
+    if cloud.boundary is not None:  # folds are one-sided too
+        marked = np.asarray(cloud.boundary)[np.asarray(neighbors.indices)]
+        one_sided &= (marked & mask[:, :, 0]).any(axis=1)
+    if not one_sided.any():
+        return neighbors
+    chosen, rows = choose_neighbors(cloud, method=method), one_sided[:, None]
+    indices = jnp.where(rows, chosen.indices, neighbors.indices)
+    return Neighbors(indices, jnp.where(rows, chosen.mask, neighbors.mask))
 
 
 def _own_in_padding(neighbors: Neighbors) -> Neighbors:

@@ -20,6 +20,8 @@ from .stencils.targets import Laplacian
 # How many of the nearest points make up the neighbourhoods of such points, in units of the usual
 # number: tried in turn. Small steps, since farther points than needed cost accuracy.
 _SIZES = (1.1, 1.2, 1.35, 1.5, 1.85, 2.25, 2.8, 3.4, 0.67, 0.45)
+# Where a method asks for the sign of the centre's weight only, small steps would just reach it.
+_SIZES_BY_SIGN = (1.5, 2.25, 3.4, 0.67, 0.45)
 # A direction along which no regular arrangement of points is symmetric.
 _OBLIQUE = (0.6180, 0.3247, 0.7549)
 
@@ -30,7 +32,8 @@ _Numbers = Float[Array, " r"] | Float[np.ndarray, " r"]
 def sizes_to_try(method: AbstractMethod, dim: int, k: int, available: int) -> list[int]:
     """Of how many of the nearest, beside the usual k; none where no larger ones can be had."""
     need = method.basis_size(dim, Laplacian())
-    sizes = [min(int(k * size), available) for size in _SIZES if k * size > 1.5 * need]
+    steps = _SIZES if method.least_dominance > 0 else _SIZES_BY_SIGN
+    sizes = [min(int(k * size), available) for size in steps if k * size > 1.5 * need]
     return sizes if max(sizes, default=0) > k else []
 
 

@@ -44,7 +44,8 @@ def test_irregular_points_get_larger_neighborhoods():
     assert 0.8 < np.mean(usual) < 1
     points = np.asarray(CLOUDS["random"].points)
     reach = [np.linalg.norm(points[a.indices[:, -1]] - points, axis=1) for a in (random, nearest)]
-    assert np.all((reach[0] > 1.1 * reach[1]) | usual)
+    farther = (reach[0] / reach[1])[~usual]
+    assert farther.min() > 1 and farther.mean() > 1.05**0.5  # of a tenth more points at least
     adapted = js.laplace_beltrami(CLOUDS["random"], random, method=method).weights
     assert jnp.all(-adapted[0] > 0.2 * jnp.sum(jnp.abs(adapted[1:]), axis=0))
     plain = js.laplace_beltrami(CLOUDS["random"], nearest, method=method).weights

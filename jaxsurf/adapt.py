@@ -84,7 +84,7 @@ def represented(points, indices, mask, size, k: int) -> tuple[Any, Any]:
     mask = mask & (xp.arange(mask.shape[1]) < size)
     offsets = points[indices] - points[indices[:, :1]]
     chosen = xp.where(xp.asarray(size) > k, _spread(xp, offsets, mask, k), mask)
-    slots = xp.argsort(~chosen, axis=1, **({"kind": "stable"} if xp is np else {}))[:, :k]
+    slots = xp.argsort(~chosen, axis=1, stable=True)[:, :k]
     held = xp.take_along_axis(chosen, slots, axis=1)
     found = xp.take_along_axis(indices, slots, axis=1)
     return xp.where(held, found, indices[:, :1]), held

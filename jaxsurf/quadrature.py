@@ -63,10 +63,8 @@ def areas(
     outward: Float[Array, "n d"] | None,
 ) -> Float[Array, " n"]:
     """Weights of the points in integrals over the surface; arguments as of `cell_weights`."""
-    args = (cloud, neighbors, degree)
-    weights, closed, residual = cell_weights(*args, _CELLS, outward)
-    if is_concrete(closed) and not closed.all():
-        weights, closed, residual = cell_weights(*args, neighbors.k, outward)
+    look = lambda cells: cell_weights(cloud, neighbors, degree, cells, outward)
+    weights, closed, residual = _by_enough(look, neighbors.k)
     text = (
         "the neighbours of point {i} do not close its cell, out of {v} of them: mark the "
         "border of the surface (`boundary`), or choose more neighbours"
@@ -85,17 +83,15 @@ def cell_areas(
 
     Where neighbours do not close a cell, as at folds of a scan, the mean of theirs, with a warning.
     """
-    args = (cloud, neighbors, degree)
-    sizes, closed, _ = _cell_sizes(*args, _CELLS, outward)
+    look = lambda cells: _cell_sizes(cloud, neighbors, degree, cells, outward)
+    sizes, closed = _by_enough(look, neighbors.k)
     if is_concrete(closed) and not closed.all():
-        sizes, closed, _ = _cell_sizes(*args, neighbors.k, outward)
-        if not closed.all():
-            warnings.warn(
-                f"the cells of {int((~closed).sum())} points, the first {int(jnp.argmin(closed))}, "
-                "are not closed by their neighbours and are given the mean area of theirs: is a "
-                "border not marked?",
-                stacklevel=4,
-            )
+        warnings.warn(
+            f"the cells of {int((~closed).sum())} points, the first {int(jnp.argmin(closed))}, "
+            "are not closed by their neighbours and are given the mean area of theirs: is a "
+            "border not marked?",
+            stacklevel=4,
+        )
     good = closed & (sizes > 0)
     counted = neighbors.mask & good[neighbors.indices]
     total = jnp.sum(jnp.where(counted, sizes[neighbors.indices], 0), axis=1)
@@ -103,6 +99,13 @@ def cell_areas(
     on = neighbors.mask[:, 0]
     sizes = jnp.where(good | ~on, sizes, mean)
     return refuse(sizes, on & ~(sizes > 0), "the cell of point {i} has the area {v}", sizes)
+
+
+def _by_enough(look: Callable, k: int):
+    """What the usual number of sides gives; where that closes not all cells, all neighbours."""
+    found = look(_CELLS)
+    closed = found[1]
+    return look(k) if is_concrete(closed) and not closed.all() else found
 
 
 @jax.jit
@@ -140,7 +143,7 @@ def _cell_sizes(cloud, neighbors, degree, cells, outward):
     sizes = planes.width ** planes.points.shape[1] * moments[:, 0]
     _, (sizes, closed) = rows_of(moments, (sizes, closed), cloud.n)
     on = neighbors.mask[:, 0]
-    return jnp.where(on, sizes, 0), closed | ~on, None
+    return jnp.where(on, sizes, 0), closed | ~on
 
 
 def _cells(cloud, neighbors, degree, cells, outward):

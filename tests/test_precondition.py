@@ -122,8 +122,8 @@ def test_constants_are_recognised():
     pinned = js.eliminate(cloud, js.dirichlet(np.array([3]), 1.0))
 
     def singular(operator, closure=None):
-        matrix = reduced_matrix(operator, conditions)
-        free = restriction_of(operator, conditions).on_host
+        matrix = reduced_matrix(operator, closure)
+        free = restriction_of(operator, closure).on_host
         return annihilates_constants(matrix, free)
 
     assert singular(laplacian) and singular(-2 * laplacian)

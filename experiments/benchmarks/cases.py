@@ -143,7 +143,8 @@ def build_beside_compadre(degree: int, n: int) -> dict:
         "error": relative_l2(operator(values), exact),
         "Compadre error": relative_l2(np.ravel(helper.applyStencil(u[:, None], target)), exact),
     }  # fmt: skip
-    del gmls, helper, kokkos  # in this order, as Compadre asks for
+    gmls = helper = None  # let go in this order, as Compadre asks for
+    del kokkos
     return found
 
 

@@ -27,12 +27,12 @@ _SMALL = 1_750_000
 # `ensure_compile_time_eval` would take apart the programs called in it as well, and compile what
 # depends on constants alone operation by operation.)
 at_once = jax.core.eval_context
-_quickly = contextvars.ContextVar("quickly", default=False)
+quickly = contextvars.ContextVar("quickly", default=False)
 
 
 def is_quick() -> bool:
     """Whether what is being traced is to be compiled quickly: code may then choose its form."""
-    return _quickly.get()
+    return quickly.get()
 
 
 def sized_jit(f: Callable) -> Callable:
@@ -47,11 +47,11 @@ def sized_jit(f: Callable) -> Callable:
         return f(*jax.tree.unflatten(structure, leaves))
 
     def quick_program(*args):
-        token = _quickly.set(True)
+        token = quickly.set(True)
         try:
             return program(*args)
         finally:
-            _quickly.reset(token)
+            quickly.reset(token)
 
     program.__name__ = quick_program.__name__ = f.__name__
     thorough = jax.jit(program, static_argnums=(1, 2))

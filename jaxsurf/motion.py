@@ -11,6 +11,7 @@ import numpy as np
 from .arguments import count_on, finite, switched_off
 from .build import residual_tolerance
 from .cloud import PointCloud
+from .compiling import sized_jit
 from .frames import frames_of
 
 # What a code says of a point.
@@ -45,7 +46,7 @@ def moved_cloud(cloud: PointCloud, points, normals, gradient: Callable[[], Calla
     return PointCloud(points, normals, boundary=cloud.boundary, active=on, spacing=spacing)
 
 
-@jax.jit
+@sized_jit
 def carried(gradient, normals, before, after):
     """Normals carried along by a motion of the points, and the factor it stretches areas by.
 
@@ -88,7 +89,7 @@ def crossed(tangents):
     return jnp.cross(tangents[:, 0], tangents[:, 1])
 
 
-@jax.jit
+@sized_jit
 def judged(cloud, neighbors, residual):
     """Codes of points: not finite, folded, degenerate."""
     ill = ~jnp.all(jnp.isfinite(cloud.points) & jnp.isfinite(cloud.normals), axis=1)
@@ -97,7 +98,7 @@ def judged(cloud, neighbors, residual):
     return jnp.where(neighbors.mask[:, 0], code, 0)
 
 
-@jax.jit
+@sized_jit
 def folded(cloud, neighbors):
     """Whether the normal of a neighbour next to a point points to the other side."""
     points, normals = cloud.points, cloud.normals
@@ -112,7 +113,7 @@ def folded(cloud, neighbors):
     return jax.lax.scan(opposite, jnp.zeros(len(points), bool), lists)[0]
 
 
-@jax.jit
+@sized_jit
 def unreached(before, after, neighbors, share=_SKIN):
     """Whether points outside a list may have come nearer than a share of the way to its farthest.
 

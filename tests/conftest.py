@@ -30,11 +30,34 @@ if importlib.util.find_spec("beartype"):
 
     install_import_hook("jaxsurf", "tests.annotations.check")
 
+from jaxsurf import compiling
+
 
 @pytest.fixture(scope="session")
 def environment() -> dict[str, str]:
     """For the commands that tests start."""
     return _as_users
+
+
+# Files that test stencils in the form that runs faster, as users compile it in programs of theirs.
+THOROUGH = (
+    "accuracy",
+    "discretization",
+    "gradients",
+    "moments",
+    "operators",
+    "sharding",
+    "stability",
+)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _in_the_form_that_compiles_faster(request):
+    """Programs that take seconds to compile are run once or twice by a test."""
+    thorough = request.module.__name__.removeprefix("tests.test_") in THOROUGH
+    token = compiling.quickly.set(not thorough)
+    yield
+    compiling.quickly.reset(token)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -19,6 +19,8 @@ from .states import dtype_of, length, small
 
 # Steps between two estimates of the spectral radius, applications in the first and in later ones.
 _REFRESH, _FIRST, _LATER = 25, 20, 4
+# The age of an estimate before there is one.
+_UNKNOWN = -1
 # A power iteration sees the radius from below.
 _SAFETY = 1.2
 
@@ -30,7 +32,7 @@ class _State(NamedTuple):
         rate: right-hand side at the current state.
         radius: estimate of the spectral radius of its Jacobian.
         direction: field that the Jacobian stretches most.
-        age: steps since the estimate.
+        age: steps since the estimate; -1 before the first.
     """
 
     rate: PyTree[Array]
@@ -116,12 +118,12 @@ class RKC2(dfx.AbstractAdaptiveSolver):
 
     def init(self, terms, t0, t1, y0, args):
         rate = terms.vf(t0, y0, args)
-        age = jnp.asarray(0)
-        if self.spectral_radius is not None:
-            return _State(rate, jnp.asarray(self.spectral_radius, dtype_of(y0)), None, age)
-        start = jax.tree.map(_noise, y0)
-        radius, direction = _power(terms, t0, y0, args, rate, start, _FIRST)
-        return _State(rate, radius, direction, age)
+        radius, direction = self.spectral_radius, None
+        if radius is None:
+            radius, direction = 0, jax.tree.map(_noise, y0)
+        return _State(
+            rate, jnp.asarray(radius, dtype_of(y0)), direction, jnp.asarray(_UNKNOWN, jnp.int32)
+        )
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         rate = after_jump(made_jump, solver_state.rate, lambda: terms.vf(t0, y0, args))
@@ -148,12 +150,11 @@ class RKC2(dfx.AbstractAdaptiveSolver):
     def _refreshed(self, terms, t0, y0, args, state: _State) -> _State:
         if self.spectral_radius is not None:
             return state
-
-        def again():
-            radius, direction = _power(terms, t0, y0, args, state.rate, state.direction, _LATER)
-            return state._replace(radius=radius, direction=direction, age=jnp.zeros_like(state.age))
-
-        return jax.lax.cond(state.age < _REFRESH, lambda: state, again)
+        later = jnp.where(state.age < _REFRESH, 0, _LATER)
+        count = jnp.where(state.age == _UNKNOWN, _FIRST, later)
+        radius, direction = _power(terms, t0, y0, args, state.rate, state.direction, count)
+        new = state._replace(radius=radius, direction=direction, age=jnp.zeros_like(state.age))
+        return jax.tree.map(lambda new, old: jnp.where(count > 0, new, old), new, state)
 
 
 def after_jump(made_jump, rate: PyTree[Array], fresh: Callable[[], PyTree[Array]]):
@@ -163,21 +164,24 @@ def after_jump(made_jump, rate: PyTree[Array], fresh: Callable[[], PyTree[Array]
     return jax.lax.cond(jnp.asarray(made_jump), fresh, lambda: rate)
 
 
-def _power(terms, t, y, args, rate, direction, count: int):
-    """Spectral radius of the Jacobian by power iterations on differences, and its direction."""
+def _power(terms, t, y, args, rate, direction, count):
+    """Spectral radius of the Jacobian by power iterations on differences, and its direction.
+
+    One loop for any number of them, none included: the rate takes long to compile.
+    """
     terms, y, args, rate, direction = constant((terms, y, args, rate, direction))
     size = small(y)
 
-    def multiply(carry, _):
+    def multiply(_, carry):
         v, _ = carry
         scale = size / length(v)
         moved = terms.vf(t, jax.tree.map(lambda y, v: y + scale * v, y, v), args)
         v = jax.tree.map(lambda a, b: (a - b) / size, moved, rate)
         stretched = length(v)
-        kept = jax.tree.map(lambda v, d: jnp.where(stretched > 0, v, d), v, direction)
-        return (kept, stretched), None
+        return jax.tree.map(lambda v, d: jnp.where(stretched > 0, v, d), v, direction), stretched
 
-    (v, radius), _ = jax.lax.scan(multiply, (direction, jnp.zeros_like(size)), length=count)
+    start = direction, jnp.zeros_like(size)
+    v, radius = jax.lax.fori_loop(0, constant(count), multiply, start)
     return constant((_SAFETY * radius, v))
 
 

@@ -42,6 +42,8 @@ from .design.taylor import TaylorRemainders as TaylorRemainders
 from .design.taylor import taylor_remainders as taylor_remainders
 from .discretization import Discretization as Discretization
 from .discretization import discretize as discretize
+from .film import animate as animate
+from .film import plot_series as plot_series
 from .frames import tangent_frames as tangent_frames
 from .ghosts import with_ghosts as with_ghosts
 from .io import read as read

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Shaped
+from jaxtyping import Array, Float, Shaped
 
-from jaxsurf.arguments import in_range, instance, real, shaped, whole
+from jaxsurf.arguments import in_range, instance, real, whole
 from jaxsurf.cloud import PointCloud
 from jaxsurf.failures import needs_values, not_finite, raise_at
 from jaxsurf.formats.by_suffix import contents_of
 from jaxsurf.formats.contents import Contents
+from jaxsurf.formats.held import check_name, columns_of, in_space
 from jaxsurf.formats.through_meshio import meshio
 from jaxsurf.normals import estimate_normals
+from jaxsurf.series import Frame, frames_of
 from jaxsurf.shapes.cleaning import clean_mesh, merge_equal
 from jaxsurf.shapes.closest import fit_surface
 from jaxsurf.shapes.meshes import TriangleMesh
@@ -235,8 +239,10 @@ def read_fields(path: str | Path, *, columns: str | None = None) -> dict[str, np
 
 def write(
     path: str | Path,
-    cloud: PointCloud,
-    fields: Mapping[str, Shaped[Array | np.ndarray, "n ..."]] | None = None,
+    cloud: PointCloud | Sequence[PointCloud],
+    fields: Mapping[str, Shaped[Array | np.ndarray, "n ..."] | Sequence] | None = None,
+    *,
+    times: Float[Array | np.ndarray, " m"] | Sequence[float] | None = None,
 ) -> None:
     """File with the points, normals and fields, for ParaView and for `read`.
 
@@ -246,15 +252,22 @@ def write(
     tensors filled with zeros. Boundary, activity and spacing go along where the cloud has them,
     except to XYZ. (In ParaView, choose *Point Gaussian* to see the points as a surface.)
 
+    With `times` it is a series: `run.pvd`, which ParaView opens as an animation, lists a VTU file
+    for each time in the folder `run`. Of an evolution with one field:
+    `js.write("run.pvd", run.clouds, {"u": run.fields}, times=run.ts)`.
+
     Args:
-        path: .vtu, .vtk, .ply or .xyz; overwritten if it exists.
-        cloud: n points.
-        fields: arrays with one row per point, by name.
+        path: .vtu, .vtk, .ply or .xyz, of a series .pvd; overwritten if it exists.
+        cloud: n points; of a series one for all times or one for each.
+        fields: arrays with one row per point, by name; of a series one for each time, or an array
+            with time first.
+        times: of a series, increasing.
 
     Raises:
         ValueError: unknown suffix; a field with another number of rows (both numbers given), of
             a shape or kind that the format does not hold, or with a name that is taken or that
-            the format does not hold (VTU: any printable text; PLY and VTK: no blanks, ASCII).
+            the format does not hold (VTU: any printable text; PLY and VTK: no blanks, ASCII);
+            other numbers of clouds or fields than of times, or times that do not increase.
         TypeError: no cloud, no mapping of fields by name, or a name that is no text.
         OSError: the file cannot be written.
         ImportError: meshio is needed and absent.
@@ -264,13 +277,28 @@ def write(
         >>> folder = tempfile.TemporaryDirectory()
         >>> cloud = js.sphere(500)
         >>> js.write(pathlib.Path(folder.name) / "sphere.vtu", cloud, {"x": cloud.points[:, 0]})
+        >>> clouds = [js.PointCloud(r * cloud.points, cloud.normals) for r in (1.0, 1.5)]
+        >>> fields = {"x": [moved.points[:, 0] for moved in clouds]}
+        >>> js.write(pathlib.Path(folder.name) / "run.pvd", clouds, fields, times=[0.0, 0.5])
     """
     path = Path(instance(path, (str, Path), "path"))
-    instance(cloud, PointCloud, "cloud", "js.PointCloud(points, normals) makes one")
     given = instance({} if fields is None else fields, Mapping, "fields", "{name: values}")
+    series = path.suffix.lower() == ".pvd"
+    if series != (times is not None):
+        raise ValueError(f"{path}: times = {times}; a series of times is a .pvd file, no other is")
+    if series:
+        _write_series(path, frames_of(cloud, given, times))
+    else:
+        _write_file(path, cloud, given)
+
+
+def _write_file(path: Path, cloud: Any, given: Mapping) -> None:
+    cloud = instance(cloud, PointCloud, "cloud", "js.PointCloud(points, normals) makes one")
     suffix = path.suffix.lower()
     if suffix not in (".vtu", ".vtk", ".ply", ".xyz"):
-        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; written are .vtu .vtk .ply .xyz")
+        raise ValueError(
+            f"{path}: unknown suffix {path.suffix!r}; written are .vtu .vtk .ply .xyz .pvd"
+        )
     instead = "write files outside jit and grad"
     needs_values("cloud and fields", cloud, dict(given), instead=instead)
     if not cloud.n:
@@ -286,17 +314,17 @@ def write(
     taken = ["normals", *_OWN]
     if suffix == ".ply":
         taken += ["x", "y", "z", "nx", "ny", "nz"]
-    data = {"normals": _in_space("normals", normals, cloud)}
+    data = {"normals": in_space("normals", normals, cloud)}
     for name, value in given.items():
-        _check_name(name, taken, suffix)
-        data[name] = _in_space(name, value, cloud)
+        check_name(name, taken, suffix)
+        data[name] = in_space(name, value, cloud)
     for name in _OWN:
         if (value := getattr(cloud, name)) is not None:
-            data[name] = _in_space(name, value, cloud)
+            data[name] = in_space(name, value, cloud)
     place = np.pad(points, ((0, 0), (0, 3 - cloud.dim)))
     library = meshio()
     if suffix == ".ply":
-        mesh = library.Mesh(place, [], point_data=_columns(data))
+        mesh = library.Mesh(place, [], point_data=columns_of(data))
         library.ply.write(path, mesh)
         return
     if suffix == ".vtu":
@@ -310,57 +338,19 @@ def write(
     (library.vtu if suffix == ".vtu" else library.vtk).write(path, mesh)
 
 
-def _check_name(name: object, taken: list[str], suffix: str) -> None:
-    if not isinstance(name, str):
-        raise TypeError(f"fields has the name {name!r} ({type(name).__name__}), expected text")
-    if name in taken:
-        raise ValueError(f"the name {name!r} is taken by the cloud itself")
-    if suffix != ".vtu" and name.split() != [name]:
-        raise ValueError(f"{suffix[1:].upper()} allows no blanks in names of fields: {name!r}")
-    if not (name and name.isprintable() and (suffix == ".vtu" or name.isascii())):
-        raise ValueError(f"{suffix[1:].upper()} holds no field of the name {name!r}")
-
-
-def _in_space(name: str, field: object, cloud: PointCloud) -> np.ndarray:
-    """A field as `(n,)` or `(n, c)` in types that files hold, with vectors in space."""
-    try:
-        value = np.asarray(field)
-    except ValueError as error:  # ragged
-        raise TypeError(f"field {name!r} is no array of numbers: {error}") from None
-    n, d = cloud.n, cloud.dim
-    shaped(value, f"field {name!r}", (n,), (n, "c"), (n, d, d))
-    if value.dtype == bool:
-        value = value.astype(np.uint8)
-    if value.dtype.kind not in "iuf" and value.dtype != jnp.bfloat16:
-        raise ValueError(f"field {name!r} holds {value.dtype}, expected real numbers")
-    if value.dtype.itemsize == 2 and value.dtype.kind not in "iu":
-        value = value.astype(np.float32)
-    lack = 3 - cloud.dim
-    if value.ndim == 3:
-        return np.pad(value, ((0, 0), (0, lack), (0, lack))).reshape(cloud.n, 9)
-    if value.ndim == 2 and value.shape[1] == cloud.dim:
-        return np.pad(value, ((0, 0), (0, lack)))
-    return value
-
-
-def _columns(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Scalars with names that PLY allows."""
-    columns: dict[str, np.ndarray] = {}
-    for name, value in data.items():
-        if value.dtype.itemsize == 8 and value.dtype.kind in "iu":
-            most = np.iinfo(np.int32).max
-            rows = value.reshape(len(value), -1)
-            bad = np.any((rows < -most - 1) | (rows > most), axis=1)
-            text = f"field {name!r} is {{v}} at point {{i}}: PLY holds integers up to {most}"
-            raise_at(bad, text, value)
-            value = value.astype(np.int32)
-        if name == "normals":
-            new = dict(zip(("nx", "ny", "nz"), value.T))
-        elif value.ndim == 2:
-            new = {f"{name}_{i}": column for i, column in enumerate(value.T)}
-        else:
-            new = {name: value}
-        if twice := columns.keys() & new.keys():
-            raise ValueError(f"two fields would have the name {twice.pop()!r} in a PLY file")
-        columns |= new
-    return columns
+def _write_series(path: Path, frames: list[Frame]) -> None:
+    folder = path.with_suffix("")
+    folder.mkdir(exist_ok=True)
+    root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
+    listed = ElementTree.SubElement(root, "Collection")
+    for i, frame in enumerate(frames):
+        file = folder / f"{folder.name}_{i:05d}.vtu"
+        _write_file(file, frame.cloud, frame.fields)
+        ElementTree.SubElement(
+            listed,
+            "DataSet",
+            timestep=repr(frame.time),
+            part="0",
+            file=f"{folder.name}/{file.name}",
+        )
+    ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)

@@ -67,17 +67,24 @@ def plot_cloud(
         >>> cloud = js.sphere(500)
         >>> ax = js.plot_cloud(cloud, cloud.points[:, 2], label="height", pixels=100)
     """
-    pyplot = _matplotlib()
-    _check_arguments(cloud, cmap, limits, pixels)
-    values = None if field is None else _checked(field, cloud, "field")
-    scene = _Scene.of(cloud, view, up, pixels)
+    pyplot = pyplot_module()
+    check_arguments(cloud, cmap, limits, pixels)
+    values = None if field is None else values_of(field, cloud, "field")
+    scene = Scene.of(cloud, view, up, pixels)
     if ax is None:
         ax = pyplot.subplots(figsize=(6, 5), layout="constrained")[1]
-    return _draw(ax, scene, values, label=label, title=title, cmap=cmap, limits=limits)
+    return _panel(ax, scene, values, label=label, title=title, cmap=cmap, limits=limits)
 
 
-def _draw(ax, scene: _Scene, values, *, label=None, title=None, cmap=None, limits=None) -> Axes:
-    colors = None if values is None else _Colors.of(values, cmap, limits)
+def _panel(ax, scene: Scene, values, *, label=None, title=None, cmap=None, limits=None) -> Axes:
+    colors = None if values is None else Colors.of(values, cmap, limits)
+    draw(ax, scene, values, colors, title)
+    if colors is not None:
+        add_bar(ax.figure, ax, colors, label)
+    return ax
+
+
+def draw(ax, scene: Scene, values, colors: Colors | None, title: str | None) -> None:
     if scene.raster is None:
         _draw_curve(ax, scene.points, scene.normals, values, colors)
     else:
@@ -87,16 +94,17 @@ def _draw(ax, scene: _Scene, values, *, label=None, title=None, cmap=None, limit
     ax.set_axis_off()
     if title is not None:
         ax.set_title(title, fontsize="medium")
-    if colors is not None:
-        bar = ax.figure.colorbar(
-            colors.mappable(), ax=ax, shrink=0.72, aspect=28, pad=0.02, extend=colors.extend
-        )
-        bar.outline.set_visible(False)
-        bar.ax.tick_params(length=2.5, labelsize="small")
-        bar.ax.locator_params(nbins=5)
-        if label is not None:
-            bar.set_label(label)
-    return ax
+
+
+def add_bar(figure, axes, colors: Colors, label: str | None) -> None:
+    bar = figure.colorbar(
+        colors.mappable(), ax=axes, shrink=0.72, aspect=28, pad=0.02, extend=colors.extend
+    )
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(length=2.5, labelsize="small")
+    bar.ax.locator_params(nbins=5)
+    if label is not None:
+        bar.set_label(label)
 
 
 def plot_fields(
@@ -138,8 +146,8 @@ def plot_fields(
         >>> path.stat().st_size > 1_000
         True
     """
-    pyplot = _matplotlib()
-    _check_arguments(cloud, cmap, limits, pixels)
+    pyplot = pyplot_module()
+    check_arguments(cloud, cmap, limits, pixels)
     if not instance(fields, Mapping, "fields", "{title: values}"):
         raise ValueError("no fields to draw: fields is empty")
     whole(columns, "columns", least=1)
@@ -147,16 +155,16 @@ def plot_fields(
     if path is not None:
         instance(path, (str, Path), "path")
     values = {
-        k: None if v is None else _checked(v, cloud, f"field {k!r}") for k, v in fields.items()
+        k: None if v is None else values_of(v, cloud, f"field {k!r}") for k, v in fields.items()
     }
-    scene = _Scene.of(cloud, view, up, pixels)
+    scene = Scene.of(cloud, view, up, pixels)
     columns = min(columns, len(fields))
     rows = -(-len(fields) // columns)
     size = (4.2 * columns + 0.3, 3.8 * rows)
     figure = pyplot.figure(figsize=size, layout="constrained")
     for i, (title, field) in enumerate(values.items()):
         ax = figure.add_subplot(rows, columns, i + 1)
-        _draw(ax, scene, field, title=title, cmap=cmap, limits=limits)
+        _panel(ax, scene, field, title=title, cmap=cmap, limits=limits)
     if path is not None:
         figure.savefig(path, dpi=dpi)
         # Written: leave nothing behind for a display.
@@ -164,7 +172,7 @@ def plot_fields(
     return figure
 
 
-def _matplotlib():
+def pyplot_module():
     try:
         from matplotlib import pyplot
     except ImportError as error:
@@ -174,7 +182,7 @@ def _matplotlib():
     return pyplot
 
 
-class _Scene(NamedTuple):
+class Scene(NamedTuple):
     """What is seen, before any field: points that are on, and for surfaces the raster."""
 
     points: Float[np.ndarray, "m d"]
@@ -182,25 +190,25 @@ class _Scene(NamedTuple):
     raster: Raster | None
 
     @staticmethod
-    def of(cloud: PointCloud, view, up, pixels: int) -> _Scene:
+    def of(cloud: PointCloud, view, up, pixels: int) -> Scene:
         on = cloud.host_active
         points, normals = np.asarray(cloud.points, float)[on], np.asarray(cloud.normals, float)[on]
         if not len(points):
             raise ValueError("nothing to draw: no point is switched on")
         if cloud.dim == 2:
-            return _Scene(points, normals, None)
+            return Scene(points, normals, None)
         closed, camera = cloud.boundary is None, camera_of(view, up)
         raster = rasterize(points, normals, closed=closed, camera=camera, pixels=pixels)
-        return _Scene(points, normals, raster)
+        return Scene(points, normals, raster)
 
 
-def _checked(field, cloud: PointCloud, name: str) -> np.ndarray:
+def values_of(field, cloud: PointCloud, name: str) -> np.ndarray:
     values, on = on_host(field, name, (cloud.n,)), cloud.host_active
     raise_at(on & ~np.isfinite(values), f"{name} is {{v}} at point {{i}}", values)
     return values[on]
 
 
-def _check_arguments(cloud, cmap, limits, pixels) -> None:
+def check_arguments(cloud, cmap, limits, pixels) -> None:
     instance(cloud, PointCloud, "cloud", "js.PointCloud(points, normals) makes one")
     whole(pixels, "pixels", least=1)
     if cmap is not None:
@@ -217,14 +225,14 @@ def _check_arguments(cloud, cmap, limits, pixels) -> None:
 # --- colours -------------------------------------------------------------------------------
 
 
-class _Colors(NamedTuple):
+class Colors(NamedTuple):
     cmap: str
     low: float
     high: float
     extend: str
 
     @staticmethod
-    def of(values, cmap, limits) -> _Colors:
+    def of(values, cmap, limits) -> Colors:
         least, most = float(values.min()), float(values.max())
         low, high = limits or _limits(values)
         signed = min(-low, high) > 0.02 * max(-low, high)
@@ -236,7 +244,7 @@ class _Colors(NamedTuple):
             low, high = low - (abs(low) or 1) / 2, high + (abs(high) or 1) / 2
         under, over = least < low - 1e-9 * (high - low), most > high + 1e-9 * (high - low)
         extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[under, over]
-        return _Colors(cmap or ("coolwarm" if signed else "viridis"), low, high, extend)
+        return Colors(cmap or ("coolwarm" if signed else "viridis"), low, high, extend)
 
     def mappable(self):
         from matplotlib.cm import ScalarMappable

@@ -296,8 +296,10 @@ def picture(c: Case, **kinds):
 
     ax = js.plot_cloud(c.cloud, c.u, pixels=60)
     figure = js.plot_fields(c.cloud, {"u": c.u, "shape": None}, pixels=60)
-    images = [np.asarray(a.images[0].get_array()) for a in (ax, *figure.axes) if a.images]
-    assert len(images) == 3
+    sheet = js.plot_series(c.cloud, [c.u, c.u], pixels=60)
+    shown = (ax, *figure.axes, *sheet.axes)
+    images = [np.asarray(a.images[0].get_array()) for a in shown if a.images]
+    assert len(images) == 5
     pyplot.close("all")
     return images
 
@@ -551,7 +553,8 @@ BESIDE = {
     "robin": "eliminate", "neumann": "with_ghosts", "VCycle": "multigrid",
     "JacobiPreconditioner": "jacobi",
     "BiCGStab": "solve", "Modes": "eigenmodes", "Spectrum": "spectral_estimate",
-    "plot_fields": "plot_cloud", "read": "write", "read_fields": "write",
+    "plot_fields": "plot_cloud", "plot_series": "plot_cloud", "animate": "plot_cloud",
+    "read": "write", "read_fields": "write",
     "GFDM": "surface_gradient", "RBFFD": "surface_gradient",
     "DCPSE": "laplace_beltrami", "Diagnostics": "laplace_beltrami",
     "PointCloud": "find_neighbors", "Neighbors": "find_neighbors",

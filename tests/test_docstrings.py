@@ -40,7 +40,8 @@ def test_every_public_name_has_an_example():
 _EXACT = {
     *("choose_neighbors", "allocate_search", "choose_solver", "identity", "sort_cloud"),
     *("dirichlet", "neumann", "robin", "free", "find_border", "detect_boundary"),
-    *("read", "read_fields", "write", "plot_cloud", "plot_fields", "clean_mesh", "sample_mesh"),
+    *("read", "read_fields", "write", "plot_cloud", "plot_fields", "plot_series"),
+    *("animate", "clean_mesh", "sample_mesh"),
     *("circle", "sphere", "ellipsoid", "graph", "surface_of_revolution", "poisson_disk"),
     *("double_torus", "jacobi", "AbstractEvolution"),
 }

@@ -4,6 +4,7 @@ import sys
 import tempfile
 import warnings
 from pathlib import Path
+from xml.etree import ElementTree
 
 import jax
 import jax.numpy as jnp
@@ -605,6 +606,23 @@ def whole_files(tmp_path_factory):
         write(path, cloud, None if kind == "xyz" else {"u": cloud.points, "v": jnp.arange(40)})
         files[path.name] = path.read_bytes()
     return files
+
+
+def test_a_series_lists_a_file_for_each_time(tmp_path):
+    path, clouds = tmp_path / "run.pvd", [ellipsoid(50), ellipsoid(60, (2.0, 1.0, 1.0))]
+    field = [cloud.points[:, 0] for cloud in clouds]
+    write(path, clouds, {"x": field}, times=jnp.array([0.0, 0.25]))
+    listed = ElementTree.parse(path).getroot().iter("DataSet")
+    found = {float(entry.get("timestep")): tmp_path / entry.get("file") for entry in listed}
+    assert list(found) == [0.0, 0.25]
+    for file, cloud, values in zip(found.values(), clouds, field):
+        np.testing.assert_array_equal(read(file).points, cloud.points)
+        np.testing.assert_array_equal(read_fields(file)["x"], values)
+    # A surface that stays, time first; written over the other.
+    write(path, clouds[0], {"x": np.stack([field[0], 2 * field[0], 3 * field[0]])}, times=[1, 2, 3])
+    files = [entry.get("file") for entry in ElementTree.parse(path).getroot().iter("DataSet")]
+    assert len(files) == 3
+    np.testing.assert_array_equal(read_fields(tmp_path / files[2])["x"], 3 * field[0])
 
 
 @settings(FEW, max_examples=200)

@@ -2,10 +2,12 @@ import sys
 
 import matplotlib
 import numpy as np
+import PIL.Image
 import pytest
 
 from jaxsurf import plot
 from jaxsurf.cloud import PointCloud
+from jaxsurf.film import animate, plot_series
 from jaxsurf.plot import plot_cloud, plot_fields
 
 matplotlib.use("Agg")
@@ -104,7 +106,7 @@ def test_points_that_are_off_are_not_drawn():
     ],
 )
 def test_colour_map_and_limits(values, low, high, cmap, extend):
-    colors = plot._Colors.of(values, None, None)
+    colors = plot.Colors.of(values, None, None)
     assert np.allclose([colors.low, colors.high], [low, high], atol=0.02)
     assert colors.extend == extend
     if values.any():
@@ -128,6 +130,50 @@ def test_panels_are_written(tmp_path):
     assert image.shape[0] > 200
     assert 0.05 < (image[..., :3].min(axis=-1) < 0.9).mean() < 0.9
     assert not matplotlib.pyplot.get_fignums()
+
+
+def breathing():
+    """A sphere that grows, and a field on it."""
+    clouds = [PointCloud(r * sphere(600).points, sphere(600).normals) for r in (1.0, 1.5, 2.0)]
+    return clouds, [cloud.points[:, 2] for cloud in clouds]
+
+
+def test_a_sheet_has_one_frame_and_one_set_of_colours(tmp_path):
+    clouds, field = breathing()
+    times, path = [0.0, 0.5, 1.0], tmp_path / "sheet.png"
+    figure = plot_series(clouds, field, times=times, path=path, columns=2, label="z", pixels=100)
+    *panels, bar = figure.axes
+    assert [ax.get_title() for ax in panels] == ["t = 0", "t = 0.5", "t = 1"]
+    assert bar.get_ylabel() == "z"
+    np.testing.assert_allclose(bar.get_ylim(), (-2, 2), atol=0.02)
+    assert len({(ax.get_xlim(), ax.get_ylim()) for ax in panels}) == 1
+    widths = [np.ptp(ax.images[0].get_extent()[:2]) for ax in panels]
+    np.testing.assert_allclose(widths[2] / widths[0], 2, rtol=0.02)
+    # The smallest sphere has the pale colours in the middle of the map only.
+    images = [picture(ax)[0] for ax in panels]
+    full = [np.abs(image[..., 0] - image[..., 2])[image[..., 3] == 1].mean() for image in images]
+    assert full[0] < 0.75 * full[2]
+    assert path.stat().st_size > 5_000
+
+
+def test_a_film_has_a_picture_for_each_time(tmp_path):
+    clouds, field = breathing()
+    path = tmp_path / "film.gif"
+    animate(path, clouds, field, times=[0.0, 0.5, 1.0], fps=10, dpi=40, pixels=60)
+    film = PIL.Image.open(path)
+    assert film.n_frames == 3 and film.info["duration"] == 100
+    pictures = []
+    for i in range(3):
+        film.seek(i)
+        pictures.append(np.asarray(film.convert("L"), float))
+    assert pictures[0].shape == pictures[2].shape == (160, 200)
+    dark = [(image < 250).sum() for image in pictures]
+    assert dark[0] < dark[1] < dark[2]
+    assert not matplotlib.pyplot.get_fignums()
+    # One field on a surface that stays, and a curve.
+    animate(path, sphere(300), np.stack([sphere(300).points[:, 2]] * 2), dpi=30, pixels=40)
+    animate(path, [circle(40), circle(60)], dpi=30)
+    assert PIL.Image.open(path).n_frames == 2
 
 
 def test_bad_input():

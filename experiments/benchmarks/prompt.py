@@ -343,6 +343,8 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
     "write": ("closed", "folder", lambda m: js.write(m.folder / "b.vtu", m.cloud)),
     "plot_cloud": ("closed", "folder", lambda m: js.plot_cloud(m.cloud, m.u) and None),
     "plot_fields": ("closed", "folder", lambda m: js.plot_fields(m.cloud, {"u": m.u}) and None),
+    "plot_series": ("closed", "folder", lambda m: js.plot_series(m.cloud, [m.u]) and None),
+    "animate": ("closed", "folder", lambda m: js.animate(m.folder / "b.gif", m.cloud, [m.u])),
     "from_points": ("closed", "raw", lambda m: js.from_points(m.raw)),
     "tangent_frames": ("closed", "", lambda m: js.tangent_frames(m.cloud.normals)),
     "tube_ratio": ("closed", "neighbors", lambda m: js.tube_ratio(m.cloud, m.neighbors)),

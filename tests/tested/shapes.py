@@ -87,9 +87,16 @@ TESTED = {
     "poisson_disk": _host(_SAMPLING + "test_poisson_disk_is_apart_and_maximal"),
     "read": _host(_IO + "test_every_mesh_format, " + _IO + "test_cloud_and_fields_come_back"),
     "read_fields": _host(_IO + "test_cloud_and_fields_come_back"),
-    "write": _host(_IO + "test_what_is_written_is_read_or_refused"),
+    "write": _host(
+        _IO
+        + "test_what_is_written_is_read_or_refused, "
+        + _IO
+        + "test_a_series_lists_a_file_for_each_time"
+    ),
     "plot_cloud": _host(_PLOT + "test_colours_follow_the_field_and_the_view"),
     "plot_fields": _host(_PLOT + "test_panels_are_written"),
+    "plot_series": _host(_PLOT + "test_a_sheet_has_one_frame_and_one_set_of_colours"),
+    "animate": _host(_PLOT + "test_a_film_has_a_picture_for_each_time"),
     "estimate_normals": _host(
         _FRAMES + "test_refit_order", _FRAMES + "test_single_precision_without_x64"
     ),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxsurf as js
+from jaxsurf.moving import follow
 
 CLOUD = js.sphere(200)
 SURFACE = js.discretize(CLOUD, method=js.GFDM(degree=2))
@@ -89,6 +90,43 @@ def test_neighbours_are_found_anew_where_a_surface_is_sheared():
     wanted = np.asarray(js.find_neighbors(found.clouds[-1], k=10).indices)
     nearest = np.asarray(found.surfaces[-1].neighbors.indices)
     assert all(set(a) <= set(b) for a, b in zip(wanted, nearest))
+
+
+@pytest.mark.slow
+def test_a_run_that_was_killed_ends_in_the_same_bits(tmp_path, monkeypatch):
+    """Neighbours are found anew on the way; what is saved before and after comes back."""
+
+    def shear(t, surface, fields, args):
+        return args * jnp.eye(3)[0] * surface.cloud.points[:, 2:]
+
+    def run(name, rate=1.2):
+        checkpoint = js.Checkpoint(tmp_path / name, every=0.3)
+        given = dict(saveat=[0.0, 0.2, 0.7], args=rate, fields=(X, Y), checkpoint=checkpoint)
+        return js.evolve(js.Motion(shear), SURFACE, t1=1.0, **given)
+
+    class Killed(Exception):
+        pass
+
+    def write_and_die(path, *content):
+        written(path, *content)
+        writes.append(path)
+        if len(writes) == 2:
+            raise Killed
+
+    whole, written, writes = run("whole"), follow.written, []
+    assert whole.stats["renewals"] > 0 and whole.ts.tolist() == [0.0, 0.2, 0.7, 1.0]
+    np.testing.assert_allclose(whole.clouds[-1].points[:, 0], X + 1.2 * Z, atol=1e-6)
+    monkeypatch.setattr(follow, "written", write_and_die)
+    with pytest.raises(Killed):
+        run("killed")
+    monkeypatch.undo()
+    arrays = lambda run: jax.tree.leaves((run.ts, run.surfaces, run.fields))
+    for again in (run("killed"), run("whole")):  # from the middle, and from the end
+        assert again.stats | {"solver": ""} == whole.stats | {"solver": ""}
+        for one, other in zip(arrays(again), arrays(whole), strict=True):
+            np.testing.assert_array_equal(one, other)
+    with pytest.raises(ValueError, match="whole is a checkpoint of another run"):
+        run("whole", rate=1.3)
 
 
 @pytest.mark.slow

@@ -10,25 +10,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ..arguments import as_float, finite, instance, real, switched_off
 from ..cloud import PointCloud
 from ..discretization import Discretization, discretize
 from ..failures import is_concrete, raise_at, refuse
-from ..motion import CODES, unreached
-from ..normals import refit_normals
-from ..renew import NeighborSearch
+from ..motion import CODES
 from ..stencils.dcpse import DCPSE
 from ..stencils.method import AbstractMethod
 from ..time.asked import check_coefficients
+from ..time.checkpoint import Checkpoint
 from ..time.integrate import integrate
 from ..time.problem import AbstractEvolution, checked_problem
+from .follow import followed
 from .motions import AbstractMotion, checked_motion
 from .problem import Moving, joined, parted
-
-# Lists are found anew once points outside may come as near as this share of the farthest in them.
-_WORN = 0.75
 
 
 class Evolution(eqx.Module):
@@ -93,6 +90,8 @@ def evolve(
     rtol: float = 1e-5,
     atol: float = 1e-7,
     args: Any = None,
+    checkpoint: Checkpoint | None = None,
+    progress: bool = False,
 ) -> Evolution:
     r"""Move a surface, and integrate an equation on it.
 
@@ -116,6 +115,10 @@ def evolve(
             None.
         args: handed to velocity, reactions and forcings: what is differentiated goes in here, or
             in `cloud` and `fields`.
+        checkpoint: write all to disk now and then, and go on from there if it is; a run that was
+            killed ends in the same bits as one that was not. After an error the last good state is
+            on disk.
+        progress: show a bar.
 
     Returns:
         `Evolution`: `ts`, `clouds`, `surfaces`, `fields`, `history`.
@@ -129,7 +132,8 @@ def evolve(
         ValueError: wrong shapes; times that are not in order; on concrete arrays a surface that
             folds (named by index, see `Discretization.code`), a fit that turns a normal over.
             Differentiated or compiled, an error of the run time.
-        IntegrationError: the end was not reached, see `integrate`.
+        IntegrationError: the end was not reached, see `integrate`. (A checkpoint is refused as
+            there: damaged, or of another run.)
     Source: Suchde and Kuhnert 2019, eqs. 28 and 42; in time by the method of lines instead.
 
     Example:
@@ -158,9 +162,14 @@ def evolve(
             )
         check_coefficients(checked_problem(problem(surface)), t0, t1)
     options = dict(solver=solver, dt0=dt0, rtol=rtol, atol=atol, args=args)
-    moving = Moving.of(surface, motion, problem)
-    run = _followed if is_concrete(surface, fields, args, t0, t1) else _kept
-    return run(moving, joined(surface.cloud.points, fields), t0, times, options)
+    moving, state = Moving.of(surface, motion, problem), joined(surface.cloud.points, fields)
+    if checkpoint is not None:
+        instance(checkpoint, Checkpoint, "checkpoint", "js.Checkpoint(path, every=...)")
+    if is_concrete(surface, fields, args, t0, t1):
+        return Evolution(*followed(moving, state, t0, times, options, checkpoint, progress))
+    if checkpoint is not None:
+        raise ValueError("a checkpoint needs concrete arrays: it is written by the host")
+    return _kept(moving, state, t0, times, options)
 
 
 def _discretized(motion, cloud, method) -> Discretization:
@@ -192,57 +201,6 @@ def _times(t0, t1, saveat) -> list:
         values[1:-1],
     )
     return [*saved, *([t1] if not saved or values[-2] < values[-1] else [])]
-
-
-# --- a run on the host: neighbours are found anew ------------------------------------------
-
-
-class _Worn(eqx.Module):
-    """True once the lists of a surface do not serve well."""
-
-    surface: Discretization
-
-    def __call__(self, t, y, args, **_) -> Bool[Array, ""]:
-        cloud, neighbors = self.surface.cloud, self.surface.neighbors
-        return jnp.any(unreached(cloud.points, y[0], neighbors, _WORN))
-
-
-def _followed(moving: Moving, state, t, times, options) -> Evolution:
-    surfaces, saved, steps, renewals = [], [], np.zeros(2, int), 0
-    search, why = None, ""
-    times = np.asarray(times, state[0].dtype)  # as the steps reach them
-    for target in times:
-        while float(t) < float(target):
-            event = dfx.Event(_Worn(moving.surface))
-            solution = integrate(moving, state, t0=t, t1=target, event=event, **options)
-            assert solution.ts is not None and solution.ys is not None
-            t, state = solution.ts[-1], jax.tree.map(lambda y: y[-1], solution.ys)
-            counts = (solution.stats[f"num_{kind}_steps"] for kind in ("accepted", "rejected"))
-            steps, why = steps + [int(count) for count in counts], solution.stats["solver"]
-            if solution.result == dfx.RESULTS.event_occurred:
-                surface, search = _renewed(moving, state[0], search)
-                moving = Moving.of(surface, moving.motion, moving.on)
-                renewals += 1
-        surfaces.append(moving.surface_at(state[0]))
-        saved.append(moving.fields(target, state))
-    stats = {"steps": int(steps[0]), "refused": int(steps[1]), "renewals": renewals, "solver": why}
-    return Evolution(jnp.asarray(times), surfaces, saved, stats)
-
-
-def _renewed(
-    moving: Moving, points, search: NeighborSearch | None
-) -> tuple[Discretization, NeighborSearch]:
-    """The surface at these points with normals and neighbours found anew, and room for the next."""
-    surface, moved = moving.surface, moving.surface_at(points)
-    normals, degree = moved.cloud.normals, surface.method.polynomial_degree
-    normals = refit_normals(points, normals, surface.neighbors, degree=degree)
-    search = surface.search() if search is None else search
-    try:
-        return surface.moved(points, normals, search=search), search
-    except ValueError:  # there is no room, or an error that will be raised again
-        cloud = eqx.tree_at(lambda c: c.normals, moved.cloud, normals)
-        surface = discretize(cloud, method=surface.method)
-        return surface, surface.search()
 
 
 # --- a run that is traced: the same neighbours all the way ----------------------------------

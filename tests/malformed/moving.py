@@ -5,6 +5,7 @@
 
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -49,6 +50,8 @@ CALLS = [
     ("evolve", "saves after the end", lambda: evolve(saveat=[0.5, 2.0]), ("saveat", "2", "1")),
     ("evolve", "a save that is text", lambda: evolve(saveat=["0.5"]), ("saveat", "'0.5'")),
     ("evolve", "a solver as text", lambda: evolve(solver="heun"), ("solver", "heun")),
+    ("evolve", "a path for a checkpoint", lambda: evolve(checkpoint="run.npz"), ("checkpoint", "run.npz", "js.Checkpoint")),
+    ("evolve", "a checkpoint in compiled code", lambda: jax.jit(lambda a: evolve(args=a, checkpoint=js.Checkpoint("run.npz", every=1.0)).ts)(1.0), ("checkpoint", "host")),
     ("evolve", "a tolerance of one", lambda: evolve(rtol=1.0), ("rtol", "1")),
     ("Motion", "an array", lambda: js.Motion(np.ones((N, 3))), ("velocity", "ndarray", "function")),
     ("Motion", "nothing", lambda: js.Motion(None), ("velocity", "None", "function")),

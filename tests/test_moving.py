@@ -92,17 +92,32 @@ def test_neighbours_are_found_anew_where_a_surface_is_sheared():
     assert all(set(a) <= set(b) for a, b in zip(wanted, nearest))
 
 
+def slanting(t, surface, fields, args):
+    return args * jnp.eye(3)[0] * surface.cloud.points[:, 2:]
+
+
+@pytest.mark.slow
+def test_steps_that_go_farther_than_the_neighbours_serve_are_shortened():
+    """To the solver a single step would do: the velocity of each point is constant."""
+    found = js.evolve(js.Motion(slanting), SURFACE, t1=1.0, args=1.0, fields=(X, Y))
+    assert found.stats["refused"] > 0 and found.stats["renewals"] > 0
+    np.testing.assert_allclose(found.clouds[-1].points[:, 0], X + Z, atol=1e-6)
+    sheared = js.discretize(found.clouds[-1], method=SURFACE.method)
+    assert jnp.all(found.surfaces[-1].code == 0) and jnp.all(sheared.code == 0)
+    # Normals of a linear map of the sphere; it ends in tips as sharp as one spacing.
+    normals = jnp.stack([X, Y, Z - X], axis=1)
+    normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+    assert float(jnp.min(jnp.sum(normals * found.clouds[-1].normals, axis=1))) > 0.95
+
+
 @pytest.mark.slow
 def test_a_run_that_was_killed_ends_in_the_same_bits(tmp_path, monkeypatch):
     """Neighbours are found anew on the way; what is saved before and after comes back."""
 
-    def shear(t, surface, fields, args):
-        return args * jnp.eye(3)[0] * surface.cloud.points[:, 2:]
-
     def run(name, rate=1.2):
         checkpoint = js.Checkpoint(tmp_path / name, every=0.3)
         given = dict(saveat=[0.0, 0.2, 0.7], args=rate, fields=(X, Y), checkpoint=checkpoint)
-        return js.evolve(js.Motion(shear), SURFACE, t1=1.0, **given)
+        return js.evolve(js.Motion(slanting), SURFACE, t1=1.0, **given)
 
     class Killed(Exception):
         pass

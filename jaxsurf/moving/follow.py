@@ -10,12 +10,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 from tqdm import tqdm
 
 from ..arguments import is_array
 from ..discretization import Discretization, discretize
 from ..motion import unreached
+from ..neighbors import Neighbors
 from ..normals import refit_normals
 from ..renew import NeighborSearch
 from ..time.checkpoint import Checkpoint, digest, read_back, written
@@ -25,6 +26,8 @@ from .problem import Moving, joined, parted
 
 # Lists are found anew once points outside may come as near as this share of the farthest in them.
 _WORN = 0.75
+# Of the way that is left; a surface that cannot be followed this far is an error.
+_LEAST = 1e-6
 
 
 class _Place(NamedTuple):
@@ -139,29 +142,38 @@ def _digest(moving: Moving, state, start, times, options, checkpoint: Checkpoint
 
 def _to(moving: Moving, state, t, target, search: NeighborSearch | None, options):
     """At a later time, with neighbours found anew on the way."""
-    counts, why = np.zeros(3, int), ""
+    counts, why, end = np.zeros(3, int), "", target
     while float(t) < float(target):
-        event = dfx.Event(_Worn(moving.surface))
-        solution = integrate(moving, state, t0=t, t1=target, event=event, **options)
+        points, neighbors = moving.surface.cloud.points, moving.surface.neighbors
+        event = dfx.Event(_Worn(points, neighbors))
+        solution = integrate(moving, state, t0=t, t1=end, event=event, **options)
         assert solution.ts is not None and solution.ys is not None
-        t, state = solution.ts[-1], jax.tree.map(lambda y: y[-1], solution.ys)
+        reached, new = solution.ts[-1], jax.tree.map(lambda y: y[-1], solution.ys)
         why, worn = solution.stats["solver"], solution.result == dfx.RESULTS.event_occurred
+        accepted, refused = (
+            int(solution.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected")
+        )
+        if jnp.any(unreached(points, new[0], neighbors)) and reached - t > _LEAST * (target - t):
+            # The last step went farther than the neighbours serve: half of the way first.
+            end = t + (reached - t) / 2
+            counts += [0, accepted + refused, 0]
+            continue
+        t, state, end = reached, new, target
         if worn:
             surface, search = _renewed(moving, state[0], search)
             moving = Moving.of(surface, moving.motion, moving.on)
-        taken = (solution.stats[f"num_{kind}_steps"] for kind in ("accepted", "rejected"))
-        counts += [*map(int, taken), int(worn)]
+        counts += [accepted, refused, int(worn)]
     return moving, state, search, counts, why
 
 
 class _Worn(eqx.Module):
-    """True once the lists of a surface do not serve well."""
+    """True once lists do not serve well, from where the points were when they were found."""
 
-    surface: Discretization
+    points: Float[Array, "n d"]
+    neighbors: Neighbors
 
     def __call__(self, t, y, args, **_) -> Bool[Array, ""]:
-        cloud, neighbors = self.surface.cloud, self.surface.neighbors
-        return jnp.any(unreached(cloud.points, y[0], neighbors, _WORN))
+        return jnp.any(unreached(self.points, y[0], self.neighbors, _WORN))
 
 
 def _renewed(

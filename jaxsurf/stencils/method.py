@@ -55,7 +55,7 @@ class Diagnostics(eqx.Module):
                 residual,
                 jnp.sum(inside, axis=0),
                 support,
-                jnp.full(support.shape, layers),
+                jnp.full(support.shape, layers, jnp.int32),
                 jnp.max(bend, axis=0) * support,
             ),
         )

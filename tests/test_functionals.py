@@ -84,9 +84,11 @@ def test_derivatives_in_the_geometry():
         return jnp.stack(values) @ jnp.array([1.0, -0.7, 2.0, 3.0, -1.0])
 
     axes, direction = jnp.array([1.0, 0.9, 0.8]), jnp.array([0.3, -0.2, 0.4])
-    steps = jnp.array([1e-2, 1e-3, 1e-4])
+    # So short that no point changes the target nearest to it: the chamfer distance has kinks there
+    # (the first between 3e-4 and 1e-3).
+    steps = jnp.array([1e-4, 3e-5, 1e-5])
     found = js.taylor_remainders(all_of_them, axes, direction, steps=steps)
-    assert abs(found.slope - 2) < 0.05, found
+    assert abs(found.slope - 2) < 0.02, found
 
 
 def test_compliance_of_the_ball():

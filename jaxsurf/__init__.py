@@ -49,6 +49,9 @@ from .ghosts import with_ghosts as with_ghosts
 from .io import read as read
 from .io import read_fields as read_fields
 from .io import write as write
+from .moving.adaptation import Adaptation as Adaptation
+from .moving.adaptation import Adapted as Adapted
+from .moving.adaptation import adapt_points as adapt_points
 from .moving.evolve import Evolution as Evolution
 from .moving.evolve import evolve as evolve
 from .moving.motions import AbstractMotion as AbstractMotion

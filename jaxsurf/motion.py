@@ -134,3 +134,17 @@ def unreached(before, after, neighbors, share=_SKIN):
     outer = (old > 0.5 * farthest) & (old > 0)
     stretch = jnp.min(jnp.where(outer, new / jnp.where(outer, old, 1), jnp.inf), axis=0)
     return stretch * farthest < share * jnp.max(new, axis=0)
+
+
+@sized_jit
+def stretch(before, after, neighbors):
+    """By which factor neighbourhoods have grown: the root of mean squared distances; 1 if empty."""
+
+    def squared(sums, slot):
+        index, used = slot
+        far = (jnp.where(used, jnp.sum((x[index] - x) ** 2, axis=1), 0) for x in (before, after))
+        return jax.tree.map(jnp.add, sums, tuple(far)), None
+
+    zero = jnp.zeros(len(after), after.dtype)
+    old, new = jax.lax.scan(squared, (zero, zero), (neighbors.indices.T, neighbors.mask.T))[0]
+    return jnp.where(old > 0, jnp.sqrt(new / jnp.where(old > 0, old, 1)), 1)

@@ -337,6 +337,14 @@ def carried(c: Case):
     return found.clouds[-1].points[c.rows], found.fields[-1]
 
 
+def thinned(c: Case):
+    """Sums over all points: those put into holes take the first rows that are free."""
+    found = js.adapt_points(c.surface, js.Adaptation(0.35, hole=0.75), c.u)
+    of_all = lambda x: jnp.sum(jnp.abs(x), axis=0)
+    sums = of_all(found.surface.cloud.points), of_all(found.fields)
+    return jnp.array([found.added, found.merged], float), *sums
+
+
 def measured(c: Case):
     targets = np.array([[1.5, 0.0, 0.2], [0.0, -1.2, 0.4]])
     s, u = c.surface, c.u
@@ -521,6 +529,7 @@ TABLE = {
     "controller": Row(lambda c: adapted(c, solver=dfx.Tsit5(), atol=0.0), SOLVED, core=True),
     "AdvectionDiffusionReaction": Row(advected),
     "evolve": Row(carried, SOLVED),
+    "adapt_points": Row(thinned, SOLVED),
     "volume": Row(measured, SOLVED),
     "BiharmonicDiffusion": Row(
         lambda c: evolved(c, js.BiharmonicDiffusion(c.laplacian), solver=js.IMEX(order=2)), SOLVED
@@ -561,7 +570,7 @@ BESIDE = {
     "AbstractOperator": "Stencil", "AbstractMethod": "laplace_beltrami",
     "AbstractPreconditioner": "jacobi", "AbstractEvolution": "integrate",
     "Motion": "evolve", "AbstractMotion": "evolve", "MeanCurvatureFlow": "evolve",
-    "Evolution": "evolve",
+    "Evolution": "evolve", "Adaptation": "adapt_points", "Adapted": "adapt_points",
     "moments": "volume", "compliance": "volume", "chamfer_distance": "volume",
 }  # fmt: skip
 

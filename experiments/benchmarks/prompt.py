@@ -230,6 +230,11 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
         "surface",
         lambda m: _last(js.evolve(js.MeanCurvatureFlow(), m.surface, t1=0.01 * m.number)),
     ),
+    "adapt_points": (
+        "closed",
+        "surface",
+        lambda m: js.adapt_points(m.surface, js.Adaptation(0.05 * m.number), m.u).fields,
+    ),
     "volume": ("closed", "surface", lambda m: js.volume(m.surface)),
     "moments": ("closed", "surface", lambda m: js.moments(m.surface)),
     "compliance": ("closed", "surface", lambda m: js.compliance(m.surface, m.u)),

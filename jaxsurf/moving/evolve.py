@@ -16,6 +16,7 @@ from ..arguments import as_float, finite, instance, real, switched_off
 from ..cloud import PointCloud
 from ..discretization import Discretization, discretize
 from ..failures import is_concrete, raise_at, refuse
+from ..kept import Kept
 from ..motion import CODES
 from ..stencils.dcpse import DCPSE
 from ..stencils.method import AbstractMethod
@@ -23,6 +24,7 @@ from ..time.asked import check_coefficients
 from ..time.checkpoint import Checkpoint
 from ..time.integrate import integrate
 from ..time.problem import AbstractEvolution, checked_problem
+from .adaptation import Adaptation, checked_adaptation, compact
 from .follow import followed
 from .motions import AbstractMotion, checked_motion
 from .problem import Moving, joined, parted
@@ -33,10 +35,10 @@ class Evolution(eqx.Module):
 
     Args:
         ts: times, `(m,)`.
-        surfaces: the surface at each.
-        fields: those at each, of the structure given.
+        rows: surface and fields at each; after adaptation with rows that are switched off.
         stats: how many steps were taken and refused, how often neighbours were found anew; the
             solver and why.
+        changes: of the points, by adaptation: times, numbers of points added and of pairs merged.
 
     Example:
         >>> motion = js.Motion(lambda t, surface, fields, args: surface.cloud.normals)
@@ -46,9 +48,23 @@ class Evolution(eqx.Module):
     """
 
     ts: Float[Array, " m"]
-    surfaces: list[Discretization]
-    fields: list[PyTree[Array]]
+    rows: list[tuple[Discretization, PyTree[Array]]]
     stats: dict[str, Any]
+    changes: Float[np.ndarray, "e 3"] | None = None
+
+    @Kept
+    def _seen(self) -> list[tuple[Discretization, PyTree[Array]]]:
+        return self.rows if self.changes is None else [compact(*row) for row in self.rows]
+
+    @property
+    def surfaces(self) -> list[Discretization]:
+        """The surface at each time; where points were added or merged, those that are on."""
+        return [surface for surface, _ in self._seen]
+
+    @property
+    def fields(self) -> list[PyTree[Array]]:
+        """The fields at each time, of the structure given, with a row for each row of `clouds`."""
+        return [fields for _, fields in self._seen]
 
     @property
     def clouds(self) -> list[PointCloud]:
@@ -59,10 +75,14 @@ class Evolution(eqx.Module):
     def history(self) -> dict[str, Any]:
         r"""Number of points, area, enclosed volume and integrals of the fields at each time.
 
-        The volume is $\\tfrac1d\\int x\\cdot n$, of closed surfaces. Raises what `areas` does.
+        The volume is $\\tfrac1d\\int x\\cdot n$, of closed surfaces. With adaptation also "events":
+        when how many points were "added" and how many pairs "merged". Raises what `areas` does.
         """
-        rows = [_measured(*row) for row in zip(self.surfaces, self.fields)]
-        return {"t": self.ts} | jax.tree.map(lambda *values: jnp.stack(values), *rows)
+        rows = [_measured(*row) for row in self.rows]
+        history = {"t": self.ts} | jax.tree.map(lambda *values: jnp.stack(values), *rows)
+        if self.changes is not None:
+            history["events"] = dict(zip(("t", "added", "merged"), self.changes.T))
+        return history
 
     def __repr__(self):
         if not is_concrete(self.ts):
@@ -71,7 +91,7 @@ class Evolution(eqx.Module):
         first, last = float(self.ts[0]), float(self.ts[-1])
         return (
             f"Evolution({len(self.surfaces)} times from {first:g} to {last:g}, "
-            f"{self.surfaces[-1].n} points, {steps})"
+            f"{self.clouds[-1].n} points, {steps})"
         )
 
 
@@ -90,6 +110,7 @@ def evolve(
     rtol: float = 1e-5,
     atol: float = 1e-7,
     args: Any = None,
+    adapt: Adaptation | None = None,
     checkpoint: Checkpoint | None = None,
     progress: bool = False,
 ) -> Evolution:
@@ -115,6 +136,9 @@ def evolve(
             None.
         args: handed to velocity, reactions and forcings: what is differentiated goes in here, or
             in `cloud` and `fields`.
+        adapt: add points in holes and merge those that crowd, at the start and on the way. What
+            the problem, the velocity or a spacing takes must then not have one row per point, but
+            be computed from the surface; the support of operators follows from the neighbours.
         checkpoint: write all to disk now and then, and go on from there if it is; a run that was
             killed ends in the same bits as one that was not. After an error the last good state is
             on disk.
@@ -153,6 +177,8 @@ def evolve(
     on = surface.cloud.active
     field = lambda u: finite(switched_off(on, as_float(u, "fields", (n, ...))), "fields")
     fields = jax.tree.map(field, fields)
+    if adapt is not None:
+        surface, fields = _with_rows(surface, fields, adapt)
     times = _times(t0, t1, saveat)
     if problem is not None:
         if not callable(problem) or isinstance(problem, AbstractEvolution):
@@ -166,7 +192,11 @@ def evolve(
     if checkpoint is not None:
         instance(checkpoint, Checkpoint, "checkpoint", "js.Checkpoint(path, every=...)")
     if is_concrete(surface, fields, args, t0, t1):
-        return Evolution(*followed(moving, state, t0, times, options, checkpoint, progress))
+        return Evolution(*followed(moving, state, t0, times, options, adapt, checkpoint, progress))
+    if adapt is not None:
+        raise ValueError(
+            "adapt needs concrete arrays: which points there are is decided on the host"
+        )
     if checkpoint is not None:
         raise ValueError("a checkpoint needs concrete arrays: it is written by the host")
     return _kept(moving, state, t0, times, options)
@@ -179,6 +209,18 @@ def _discretized(motion, cloud, method) -> Discretization:
         return cloud
     instance(cloud, PointCloud, "cloud", "js.PointCloud(points, normals), or js.discretize(cloud)")
     return discretize(cloud, method=DCPSE(order=2) if method is None else method)
+
+
+def _with_rows(
+    surface: Discretization, fields, adapt: Adaptation
+) -> tuple[Discretization, PyTree[Array]]:
+    """With rows that can be switched on, and nothing else that is given per point."""
+    checked_adaptation(adapt, surface)
+    room = max(0, (adapt.capacity or 0) - surface.n)
+    on = jnp.pad(jnp.asarray(surface.cloud.host_active), (0, room))
+    more = lambda u: jnp.pad(u, ((0, room), *((0, 0),) * (u.ndim - 1)))
+    cloud = PointCloud(more(surface.cloud.points), more(surface.cloud.normals), active=on)
+    return discretize(cloud, method=surface.method), jax.tree.map(more, fields)
 
 
 def _times(t0, t1, saveat) -> list:
@@ -207,7 +249,7 @@ def _times(t0, t1, saveat) -> list:
 
 
 def _kept(moving: Moving, state, t, times, options) -> Evolution:
-    surfaces, saved = [], []
+    rows = []
     for target in times:
         if target is not t:
             found = integrate(moving, state, t0=t, t1=target, **options)
@@ -218,9 +260,9 @@ def _kept(moving: Moving, state, t, times, options) -> Evolution:
             f"{number}: {text}" for number, text in CODES.items()
         )
         points = refuse(points, jnp.any(code > 0), text)
-        surfaces.append(moving.surface_at(points))
-        saved.append(moving.fields(target, joined(points, fields)))
-    return Evolution(jnp.stack([jnp.asarray(s) for s in times]), surfaces, saved, {})
+        fields = moving.fields(target, joined(points, fields))
+        rows.append((moving.surface_at(points), fields))
+    return Evolution(jnp.stack([jnp.asarray(s) for s in times]), rows, {})
 
 
 # --- what is told of it --------------------------------------------------------------------

@@ -15,15 +15,18 @@ from tqdm import tqdm
 
 from ..arguments import is_array
 from ..discretization import Discretization, discretize
-from ..motion import unreached
+from ..motion import stretch, unreached
 from ..neighbors import Neighbors
 from ..normals import refit_normals
 from ..renew import NeighborSearch
 from ..time.checkpoint import Checkpoint, digest, read_back, written
 from ..time.integrate import integrate
 from ..time.run import planned
+from .adaptation import Adaptation, changed, conserved
 from .problem import Moving, joined, parted
 
+# Points are added and merged where neighbourhoods have grown or shrunk by this factor.
+_STRETCH = 1.15
 # Lists are found anew once points outside may come as near as this share of the farthest in them.
 _WORN = 0.75
 # Of the way that is left; a surface that cannot be followed this far is an error.
@@ -48,64 +51,62 @@ class _Progress(NamedTuple):
     Args:
         part: number of parts done.
         place: at the end of the last.
-        saved: at the times asked for; those not reached hold anything of these shapes.
+        saved: at the times asked for; those not reached hold anything.
         counts: steps accepted and refused, and how often neighbours were found anew.
+        changes: of the points: times, numbers of points added and of pairs merged.
     """
 
     part: Any
     place: _Place
     saved: list[_Place]
     counts: Any
+    changes: Any
 
 
 def followed(
-    moving: Moving, state, t0, times, options, checkpoint: Checkpoint | None, progress: bool
+    moving: Moving,
+    state,
+    t0,
+    times,
+    options,
+    adapt: Adaptation | None,
+    checkpoint: Checkpoint | None,
+    progress: bool,
 ) -> tuple:
-    """Times, surfaces, fields and statistics of an `Evolution`."""
+    """Times, surfaces with fields, statistics and changes of an `Evolution`."""
     times, start = np.asarray(times, state[0].dtype), np.asarray(t0, state[0].dtype)
-    saved: list = [None] * len(times)
-    now = _Progress(np.array(0), _place(moving, state), saved, np.zeros(3, int))
-    ends, file, why = times[-1:], None, ""
+    ends, file = times[-1:], None
     if checkpoint is not None:
         ends = _ends(start, times[-1], checkpoint.every)
-        file = _File(checkpoint, _digest(moving, state, start, times, options, checkpoint))
-        now, why = file.read(now._replace(saved=[_saved(moving, state, start)] * len(times)))
-    saved, search = list(now.saved), None
-    bar = tqdm(total=float(times[-1] - start), disable=not progress, unit="t")
-    with bar:
+        file = _File(checkpoint, _digest(moving, state, start, times, options, adapt, checkpoint))
+    run = _Run(moving, state, start, options, adapt)
+    saved: list = [run.saved] * len(times)
+    now = _Progress(np.array(0), run.place, saved, run.counts, run.changes)
+    if file is not None:
+        now, run.solver = file.read(now, adapt is None)
+    if adapt is not None and not now.part:
+        run.adapt_points()
+        now = now._replace(place=run.place, changes=run.changes)
+    saved = list(now.saved)
+    with tqdm(total=float(times[-1] - start), disable=not progress, unit="t") as bar:
         for part in range(int(now.part), len(ends)):
             t, end = ends[part - 1] if part else start, ends[part]
-            state, counts = now.place.state, np.asarray(now.counts)
             if file is not None:  # from nothing but what is on disk
-                moving, search = Moving.of(now.place.surface, moving.motion, moving.on), None
+                run.goes_on(t, now)
             here = (part == 0) & (times == t) | (times > t) & (times <= end)
             for i in [*np.flatnonzero(here), None]:
-                target = end if i is None else times[i]
-                moving, state, search, new, told = _to(moving, state, t, target, search, options)
-                bar.update(float(target - t))
-                t, counts, why = target, counts + new, told or why
+                before = run.t
+                run.to(end if i is None else times[i])
+                bar.update(float(run.t - before))
                 if i is not None:
-                    saved[i] = _saved(moving, state, target)
-            now = _Progress(np.array(part + 1), _place(moving, state), saved, counts)
+                    saved[i] = run.saved
+            now = _Progress(np.array(part + 1), run.place, saved, run.counts, run.changes)
             if file is not None:
                 file.write(now)
     steps, refused, renewals = map(int, now.counts)
-    stats = {"steps": steps, "refused": refused, "renewals": renewals, "solver": why}
-    fields = [parted(place.state)[1] for place in saved]
-    return jnp.asarray(times), [place.surface for place in saved], fields, stats
-
-
-def _place(moving: Moving, state) -> _Place:
-    surface = moving.surface
-    plain = Discretization(surface.cloud, surface.neighbors, surface.method, surface.border)
-    return _Place(plain, state)
-
-
-def _saved(moving: Moving, state, t) -> _Place:
-    surface = moving.surface_at(state[0])
-    # What was wrong with it would have been an error.
-    surface = eqx.tree_at(lambda s: s.found, surface, None, is_leaf=lambda x: x is None)
-    return _Place(surface, joined(state[0], moving.fields(t, state)))
+    stats = {"steps": steps, "refused": refused, "renewals": renewals, "solver": run.solver}
+    rows = [(place.surface, parted(place.state)[1]) for place in saved]
+    return jnp.asarray(times), rows, stats, None if adapt is None else np.asarray(now.changes)
 
 
 class _File(NamedTuple):
@@ -114,14 +115,14 @@ class _File(NamedTuple):
     checkpoint: Checkpoint
     key: str
 
-    def read(self, now: _Progress) -> tuple[_Progress, str]:
+    def read(self, now: _Progress, same_sizes: bool) -> tuple[_Progress, str]:
         """What is there, and that it is; else what is given."""
         path = Path(self.checkpoint.path)
         if not path.exists():
             return now, ""
         arrays, others = eqx.partition(now, is_array)
-        arrays = jax.tree.map(jnp.asarray, read_back(path, self.key, arrays))
-        return eqx.combine(arrays, others), "read from disk"
+        arrays = read_back(path, self.key, arrays, same_sizes=same_sizes)
+        return eqx.combine(jax.tree.map(jnp.asarray, arrays), others), "read from disk"
 
     def write(self, now: _Progress) -> None:
         written(Path(self.checkpoint.path), self.key, eqx.filter(now, is_array))
@@ -133,60 +134,131 @@ def _ends(start, end, every: float) -> np.ndarray:
     return np.append(start + every * np.arange(1, count), end).astype(end.dtype)
 
 
-def _digest(moving: Moving, state, start, times, options, checkpoint: Checkpoint) -> str:
+def _digest(moving: Moving, state, start, times, options, adapt, checkpoint: Checkpoint) -> str:
     """Of all that a run hangs on; functions by what they compute."""
     unset = dict.fromkeys(("controller", "saveat", "event", "adjoint", "max_steps"))
     plan = planned(moving, state, start, times[-1], **options, **unset, progress=False, throw=True)
-    return digest((checkpoint.every, times, moving.surface.neighbors, plan.run))
+    return digest((checkpoint.every, times, moving.surface.neighbors, adapt, plan.run))
 
 
-def _to(moving: Moving, state, t, target, search: NeighborSearch | None, options):
-    """At a later time, with neighbours found anew on the way."""
-    counts, why, end = np.zeros(3, int), "", target
-    while float(t) < float(target):
-        points, neighbors = moving.surface.cloud.points, moving.surface.neighbors
-        event = dfx.Event(_Worn(points, neighbors))
-        solution = integrate(moving, state, t0=t, t1=end, event=event, **options)
-        assert solution.ts is not None and solution.ys is not None
-        reached, new = solution.ts[-1], jax.tree.map(lambda y: y[-1], solution.ys)
-        why, worn = solution.stats["solver"], solution.result == dfx.RESULTS.event_occurred
-        accepted, refused = (
-            int(solution.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected")
-        )
-        if jnp.any(unreached(points, new[0], neighbors)) and reached - t > _LEAST * (target - t):
-            # The last step went farther than the neighbours serve: half of the way first.
-            end = t + (reached - t) / 2
-            counts += [0, accepted + refused, 0]
-            continue
-        t, state, end = reached, new, target
-        if worn:
-            surface, search = _renewed(moving, state[0], search)
-            moving = Moving.of(surface, moving.motion, moving.on)
-        counts += [accepted, refused, int(worn)]
-    return moving, state, search, counts, why
+class _Run:
+    """A run under way: points, fields and lists now, and what it took to come here."""
+
+    def __init__(self, moving: Moving, state, t, options, adapt: Adaptation | None):
+        self.moving, self.state, self.t = moving, state, t
+        self.options, self.adapt, self.solver = options, adapt, ""
+        self.search: NeighborSearch | None = None
+        self.counts, self.changes = np.zeros(3, int), np.zeros((0, 3))
+
+    def goes_on(self, t, now: _Progress) -> None:
+        """From what is on disk, or would be."""
+        self.moving = Moving.of(now.place.surface, self.moving.motion, self.moving.on)
+        self.t, self.state, self.search = t, now.place.state, None
+        self.counts, self.changes = np.asarray(now.counts), np.asarray(now.changes)
+
+    @property
+    def place(self) -> _Place:
+        surface = self.moving.surface
+        plain = Discretization(surface.cloud, surface.neighbors, surface.method, surface.border)
+        return _Place(plain, self.state)
+
+    @property
+    def saved(self) -> _Place:
+        surface = self.moving.surface_at(self.state[0])
+        # What was wrong with it would have been an error.
+        surface = eqx.tree_at(lambda s: s.found, surface, None, is_leaf=lambda x: x is None)
+        fields = self.moving.fields(self.t, self.state)
+        return _Place(surface, joined(self.state[0], fields))
+
+    def count(self, steps: int, refused: int, renewals: int) -> None:
+        self.counts = self.counts + np.array([steps, refused, renewals])
+
+    def to(self, target) -> None:
+        """To a later time, with neighbours found anew and points adapted on the way."""
+        every = np.inf if self.adapt is None or self.adapt.every is None else self.adapt.every
+        end = target
+        while float(self.t) < float(target):
+            end = min(end, self.t + every)
+            surface, neighbors = self.moving.surface, self.moving.surface.neighbors
+            event = dfx.Event(_Worn(surface.cloud.points, neighbors, self.adapt is not None))
+            solution = integrate(
+                self.moving, self.state, t0=self.t, t1=end, event=event, **self.options
+            )
+            assert solution.ts is not None and solution.ys is not None
+            reached, new = solution.ts[-1], jax.tree.map(lambda y: y[-1], solution.ys)
+            steps, refused = (
+                int(solution.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected")
+            )
+            self.solver = solution.stats["solver"]
+            left = reached - self.t > _LEAST * (target - self.t)
+            if left and jnp.any(unreached(surface.cloud.points, new[0], neighbors)):
+                # The last step went farther than the neighbours serve: half of the way first.
+                end = self.t + (reached - self.t) / 2
+                self.count(0, steps + refused, 0)
+                continue
+            self.count(steps, refused, 0)
+            self.t, self.state, end = reached, new, target
+            if solution.result == dfx.RESULTS.event_occurred or float(reached) < float(target):
+                self.renew()
+
+    def renew(self) -> None:
+        """Normals and neighbours found anew, and points adapted."""
+        surface, moved = self.moving.surface, self.moving.surface_at(self.state[0])
+        normals, degree = moved.cloud.normals, surface.method.polynomial_degree
+        points = moved.cloud.points
+        normals = refit_normals(points, normals, surface.neighbors, degree=degree)
+        cloud = eqx.tree_at(lambda c: c.normals, moved.cloud, normals)
+        if self.search is None:
+            self.search = surface.search()
+        surface = Discretization(cloud, surface.neighbors, surface.method, surface.border)
+        self.count(0, 0, 1)
+        if self.adapt is None or not self.adapt_points(surface):
+            self.begin(surface)
+
+    def begin(self, surface: Discretization) -> None:
+        """On a surface whose lists were found for other points."""
+        cloud = surface.cloud
+        try:
+            if self.search is None:
+                raise ValueError("there is no room")
+            surface = surface.moved(cloud.points, cloud.normals, search=self.search)
+        except ValueError:  # or an error that will be raised again
+            surface = discretize(cloud, method=surface.method)
+            self.search = surface.search()
+        self.moving = Moving.of(surface, self.moving.motion, self.moving.on)
+
+    def adapt_points(self, surface: Discretization | None = None) -> bool:
+        """Points added and merged, if need be."""
+        assert self.adapt is not None
+        surface = self.moving.surface if surface is None else surface
+        fields = parted(self.state)[1]
+        spacing = self.adapt.at(self.t, surface, fields, self.options["args"])
+        cloud, lists, new, *count = changed(surface, fields, self.adapt, spacing)
+        if not any(count):
+            return False
+        self.begin(Discretization(cloud, lists, surface.method))
+        if self.adapt.conserve:
+            new = conserved(surface, fields, self.moving.surface, new)
+        self.state = joined(cloud.points, new)
+        self.changes = np.append(self.changes, [[float(self.t), *count]], axis=0)
+        return True
 
 
 class _Worn(eqx.Module):
-    """True once lists do not serve well, from where the points were when they were found."""
+    """True once lists do not serve well, from where the points were when they were found.
+
+    Args:
+        uneven: also where neighbourhoods have become so much larger or smaller that points are to
+            be added or merged.
+    """
 
     points: Float[Array, "n d"]
     neighbors: Neighbors
+    uneven: bool = eqx.field(static=True)
 
     def __call__(self, t, y, args, **_) -> Bool[Array, ""]:
-        return jnp.any(unreached(self.points, y[0], self.neighbors, _WORN))
-
-
-def _renewed(
-    moving: Moving, points, search: NeighborSearch | None
-) -> tuple[Discretization, NeighborSearch]:
-    """The surface at these points with normals and neighbours found anew, and room for the next."""
-    surface, moved = moving.surface, moving.surface_at(points)
-    normals, degree = moved.cloud.normals, surface.method.polynomial_degree
-    normals = refit_normals(points, normals, surface.neighbors, degree=degree)
-    search = surface.search() if search is None else search
-    try:
-        return surface.moved(points, normals, search=search), search
-    except ValueError:  # there is no room, or an error that will be raised again
-        cloud = eqx.tree_at(lambda c: c.normals, moved.cloud, normals)
-        surface = discretize(cloud, method=surface.method)
-        return surface, surface.search()
+        worn = unreached(self.points, y[0], self.neighbors, _WORN)
+        if self.uneven:
+            growth = stretch(self.points, y[0], self.neighbors)
+            worn = worn | (growth > _STRETCH) | (growth < 1 / _STRETCH)
+        return jnp.any(worn)

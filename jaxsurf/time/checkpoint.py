@@ -212,8 +212,8 @@ def written(path: Path, key: str, now: PyTree) -> None:
     os.replace(partial, path)
 
 
-def read_back(path: Path, key: str, like: Any) -> Any:
-    """What was written: of the same run, with arrays as in `like`."""
+def read_back(path: Path, key: str, like: Any, *, same_sizes: bool = True) -> Any:
+    """What was written: of the same run, with arrays as in `like`, or of other sizes."""
     expected, structure = jax.tree.flatten(like)
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -223,7 +223,8 @@ def read_back(path: Path, key: str, like: Any) -> Any:
         raise ValueError(f"{path} does not hold a checkpoint, or is damaged: {error}") from error
     if seal != digest((found, leaves)):
         raise ValueError(f"{path} is damaged: its content does not have the digest {seal}")
-    shapes = [[(np.shape(leaf), np.asarray(leaf).dtype) for leaf in x] for x in (leaves, expected)]
+    size = lambda leaf: np.shape(leaf) if same_sizes else np.ndim(leaf)
+    shapes = [[(size(leaf), np.asarray(leaf).dtype) for leaf in x] for x in (leaves, expected)]
     if found != key or shapes[0] != shapes[1]:
         raise ValueError(
             f"{path} is a checkpoint of another run: problem, initial state, times or settings "

@@ -11,7 +11,33 @@ _SLOPES, _MAPPED = (
 _OUTRUN = _M + "test_a_compiled_motion_that_outruns_its_neighbours_is_an_error"
 _SHRUNK = _M + "test_a_sphere_shrinks_by_its_curvature"
 
+_A = "test_adaptation.py::"
+_FILLED = (
+    f"{_A}test_holes_are_filled_and_crowds_thinned, {_A}test_gaps_of_curves_are_filled, "
+    f"{_A}test_spacing_may_follow_the_curvature_and_integrals_stay"
+)
+_CHOSEN = "(which points there are is decided on the host)"
+
+_ADAPTED: dict[str, Entry] = {
+    "value": f"{_FILLED}, {_A}test_points_are_added_while_a_sphere_grows",
+    "gradient": _CHOSEN,
+    "jit": _CHOSEN,
+    "vmap": _CHOSEN,
+    "float32": _A + "test_in_single_precision",
+    "bad input": f"malformed, {_A}test_an_error_says_how_many_points_are_needed",
+}
+
 TESTED: dict[str, dict[str, Entry]] = {
+    "Adaptation": _ADAPTED,
+    "adapt_points": _ADAPTED,
+    "Adapted": {
+        "value": _FILLED,
+        "gradient": _CHOSEN,
+        "jit": _CHOSEN,
+        "vmap": _CHOSEN,
+        "float32": _A + "test_in_single_precision",
+        "bad input": "(returned, not made)",
+    },
     "evolve": {
         "value": f"{_HEAT}, {_M}test_a_rigid_motion_and_what_is_saved, "
         f"{_M}test_neighbours_are_found_anew_where_a_surface_is_sheared, "

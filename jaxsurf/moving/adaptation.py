@@ -1,0 +1,287 @@
+r"""Points added in holes and merged where they crowd, with fields on them."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, PyTree
+
+from ..arguments import as_float, finite, instance, real, switched_off, whole
+from ..cloud import PointCloud
+from ..discretization import Discretization, discretize
+from ..failures import needs_values, raise_at
+from ..interpolation import interpolated, nearest_points
+from ..neighbors import Neighbors, find_neighbors
+from .holes import close_pairs, fillings
+
+# Each round fills the largest holes that do not touch, so the number of points may triple in it.
+_ROUNDS = 30
+# By how much the arrays grow when they are full, at least: all that has been compiled is lost.
+_GROWTH = 1.5
+# New points are interpolated in arrays of such sizes, times powers of two.
+_ROOM = 64
+
+
+class Adaptation(eqx.Module):
+    r"""How far points are to be apart: where they are added, and where they are merged.
+
+    A hole is an empty circle through points whose centre is inside their triangle (on plane curves
+    a gap). A point goes into each, on the local polynomial surface of the operators' degree; two
+    points that are too close become one between them. Fields are interpolated by the same
+    polynomials. Surfaces without borders.
+
+    Args:
+        spacing: distance h between neighbours, in length: a cloud has about area / h² points. A
+            number, or a function `(t, surface, fields, args) -> (n,)` of operations of JAX.
+        hole: radius of the largest empty circle, in spacings.
+        closest: distance at which two points become one, in spacings.
+        every: the longest time between two looks; besides, there is one whenever a neighbourhood
+            has been stretched or has shrunk by 15 %. For spacings that change in time.
+        conserve: add a constant to each field after each change, so that its integral stays.
+        capacity: most points there may be, in arrays that have this length from the start, so that
+            nothing compiles on the way. None: they grow by half, or more, when they are full.
+
+    Raises:
+        TypeError: a spacing that is no number or function; other arguments that are no numbers.
+        ValueError: a spacing, hole, closest distance, time or capacity that is not positive; holes
+            so small that points in them would be too close.
+    Source: Suchde and Kuhnert 2019, Section 3.3.2 (there 0.45 and 0.2 of a smoothing length, which
+        is two spacings here); new points are on local polynomials instead of eqs. 8 and 9.
+
+    Example:
+        >>> adaptation = js.Adaptation(spacing=0.15)
+        >>> grow = js.Motion(lambda t, surface, fields, args: surface.cloud.normals)
+        >>> run = js.evolve(grow, js.sphere(600), t1=0.5, adapt=adaptation)
+        >>> run.clouds[-1].n > 1000, run.stats["renewals"] > 0
+        (True, True)
+    """
+
+    spacing: Float[Array, ""] | Callable
+    hole: float = eqx.field(static=True)
+    closest: float = eqx.field(static=True)
+    every: float | None = eqx.field(static=True)
+    conserve: bool = eqx.field(static=True)
+    capacity: int | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        spacing: ArrayLike | Callable,
+        *,
+        hole: float = 0.9,
+        closest: float = 0.4,
+        every: float | None = None,
+        conserve: bool = False,
+        capacity: int | None = None,
+    ):
+        self.spacing = (
+            spacing if callable(spacing) else jnp.asarray(real(spacing, "spacing", above=0))
+        )
+        self.hole = float(real(hole, "hole", above=0))
+        self.closest = float(real(closest, "closest", above=0))
+        if self.closest > 0.75 * self.hole:
+            raise ValueError(
+                f"closest = {self.closest:g}, expected at most {0.75 * self.hole:g}, "
+                "three quarters of hole: points put into holes would be merged again"
+            )
+        self.every = None if every is None else float(real(every, "every", above=0))
+        self.conserve = bool(instance(conserve, (bool, np.bool_), "conserve"))
+        self.capacity = None if capacity is None else whole(capacity, "capacity", least=1)
+
+    def at(self, t, surface: Discretization, fields, args) -> Float[np.ndarray, " n"]:
+        """The spacing wanted at each point."""
+        if not callable(self.spacing):
+            return np.full(surface.n, float(self.spacing))
+        given = as_float(self.spacing(t, surface, fields, args), "spacing", (surface.n,), ())
+        h, on = np.broadcast_to(np.asarray(given, float), surface.n), surface.cloud.host_active
+        text = "the spacing wanted at point {i} is {v}, expected a positive number"
+        raise_at(on & ~((h > 0) & np.isfinite(h)), text, h)
+        return np.where(on, h, 1.0)
+
+
+class Adapted(NamedTuple):
+    """A surface with other points, made by `adapt_points`.
+
+    Args:
+        surface: with its neighbours found anew.
+        fields: on it.
+        added, merged: how many points were put into holes, how many pairs became one.
+
+    Example:
+        >>> js.adapt_points(js.discretize(js.sphere(500)), js.Adaptation(spacing=1.0)).added
+        0
+    """
+
+    surface: Discretization
+    fields: PyTree[Array]
+    added: int
+    merged: int
+
+
+def adapt_points(
+    surface: Discretization,
+    adaptation: Adaptation,
+    fields: PyTree[Array] = (),
+    *,
+    t: ArrayLike = 0.0,
+    args: Any = None,
+) -> Adapted:
+    r"""Add and merge points until no hole and no crowd is left.
+
+    Args:
+        surface: from `discretize`, without a border.
+        adaptation: the spacing wanted.
+        fields: on the surface, `(n, *c)`, or several as a tuple.
+        t, args: handed to a spacing that is a function.
+
+    Returns:
+        `surface`, `fields`, `added`, `merged`. Rows that were switched off are gone.
+
+    Accuracy: new points are off the surface by $O(h^{p+1})$ with p the degree of the method's
+        polynomials, as `Discretization.interpolate` of smooth fields
+        (`tests/test_adaptation.py::test_new_points_are_on_the_surface`); in float32 within 1e-5.
+    Not differentiable: which points there are is decided on the host.
+    Raises:
+        TypeError: arguments of other kinds.
+        ValueError: a surface with a border or traced; fields of another shape or not finite; more
+            points than the capacity; holes that are left after 30 rounds.
+    Source: as `Adaptation`.
+
+    Example:
+        >>> surface = js.discretize(js.sphere(500), method=js.GFDM(degree=4))
+        >>> finer, u, added, merged = js.adapt_points(
+        ...     surface, js.Adaptation(spacing=0.1), surface.cloud.points[:, 2]
+        ... )
+        >>> bool(jnp.abs(u - finer.cloud.points[:, 2]).max() < 1e-3), finer.n > 1000, merged
+        (True, True, 0)
+    """
+    instance(surface, Discretization, "surface", "js.discretize(cloud) makes one")
+    checked_adaptation(adaptation, surface)
+    field = lambda u: finite(
+        as_float(u, "fields", (surface.n, ...)), "fields", surface.cloud.active
+    )
+    fields = jax.tree.map(field, fields)
+    spacing = adaptation.at(t, surface, fields, args)
+    cloud, _, new, added, merged = changed(surface, fields, adaptation, spacing)
+    if not added + merged:
+        return Adapted(surface, fields, 0, 0)
+    on = np.flatnonzero(cloud.host_active)
+    after = discretize(PointCloud(cloud.points[on], cloud.normals[on]), method=surface.method)
+    new = jax.tree.map(lambda u: u[on], new)
+    if adaptation.conserve:
+        new = conserved(surface, fields, after, new)
+    return Adapted(after, new, added, merged)
+
+
+def checked_adaptation(adaptation: Any, surface: Discretization) -> None:
+    """Refuse what is none, and surfaces that it cannot serve."""
+    instance(adaptation, Adaptation, "adapt", "js.Adaptation(spacing=...)")
+    needs_values("the surface whose points are adapted", surface)
+    if surface.border is not None:
+        raise ValueError(
+            f"the surface has {len(surface.border.points)} points on its border: points are added "
+            "and merged on surfaces without borders only"
+        )
+
+
+def changed(
+    surface: Discretization,
+    fields: PyTree[Array],
+    adaptation: Adaptation,
+    spacing: Float[np.ndarray, " n"],
+) -> tuple[PointCloud, Neighbors, PyTree[Array], int, int]:
+    """Points and fields, their arrays longer if need be, and lists of the usual size."""
+    cloud, neighbors = surface.cloud, surface.neighbors
+    degree, k = surface.method.polynomial_degree, surface.method.neighbor_count(cloud.dim)
+    added = merged = 0
+    for _ in range(_ROUNDS):
+        pairs = close_pairs(cloud, neighbors, adaptation.closest * spacing)
+        holes = fillings(cloud, neighbors, adaptation.hole * spacing)
+        if not len(pairs) + len(holes):
+            return cloud, neighbors, fields, added, merged
+        added, merged = added + len(holes), merged + len(pairs)
+        at = np.concatenate([np.mean(np.asarray(cloud.points)[pairs], axis=1), holes])
+        arrays = (cloud.points, cloud.normals, fields)
+        values = _interpolated(cloud, neighbors, degree, at, arrays)
+        wanted = spacing[np.asarray(nearest_points(cloud.points, cloud.active, jnp.asarray(at)))]
+        on = np.array(cloud.host_active)
+        on[pairs[:, 1]] = False
+        on = np.append(on, np.zeros(_more_rows(on, len(holes), adaptation.capacity), bool))
+        rows = np.append(pairs[:, 0], np.flatnonzero(~on)[: len(holes)])
+        on[rows], spacing = True, np.append(spacing, np.ones(len(on) - len(spacing)))
+        spacing[rows] = wanted
+        put = functools.partial(_put, rows, len(on))
+        points, normals, fields = jax.tree.map(put, arrays, values)
+        cloud = PointCloud(points, normals, active=jnp.asarray(on))
+        neighbors = _widened(find_neighbors(cloud, k), surface.neighbors.k)
+    raise ValueError(
+        f"{len(holes)} holes and {len(pairs)} crowded pairs of points are left after {_ROUNDS} "
+        "rounds: the spacing wanted may change too much between neighbours"
+    )
+
+
+def compact(surface: Discretization, fields: PyTree[Array]) -> tuple[Discretization, PyTree[Array]]:
+    """Without the rows that are switched off."""
+    cloud, lists = surface.cloud, surface.neighbors
+    on = np.flatnonzero(cloud.host_active)
+    row = np.zeros(cloud.n, np.int32)
+    row[on] = np.arange(len(on))
+    cloud = PointCloud(cloud.points[on], cloud.normals[on])
+    lists = Neighbors(jnp.asarray(row[np.asarray(lists.indices)[on]]), lists.mask[on])
+    return Discretization(cloud, lists, surface.method), jax.tree.map(lambda u: u[on], fields)
+
+
+def conserved(before: Discretization, old, after: Discretization, new) -> PyTree[Array]:
+    """Fields with a constant added, so that their integrals are what they were."""
+    area = jnp.sum(after.areas)
+
+    def corrected(u, v):
+        lost = before.integrate(u) - after.integrate(v)
+        return switched_off(after.cloud.active, v + (lost / area).astype(v.dtype))
+
+    return jax.tree.map(corrected, old, new)
+
+
+def _interpolated(cloud, neighbors, degree: int, at, arrays) -> PyTree[Array]:
+    """Points, normals and fields at some places above the surface, in one go."""
+    leaves, structure = jax.tree.flatten(arrays)
+    together = jnp.concatenate([u.reshape(len(u), -1) for u in leaves], axis=1)
+    count = len(at)
+    room = _ROOM * 2 ** max(0, math.ceil(math.log2(count / _ROOM)))
+    padded = jnp.asarray(np.append(at, np.repeat(at[:1], room - count, axis=0), axis=0))
+    found = interpolated(cloud, neighbors, degree, padded.astype(cloud.points.dtype), together)
+    parts = jnp.split(found[:count], np.cumsum([u[0].size for u in leaves])[:-1], axis=1)
+    parts = [v.reshape(count, *u.shape[1:]).astype(u.dtype) for u, v in zip(leaves, parts)]
+    points, normals, fields = jax.tree.unflatten(structure, parts)
+    return points, normals / jnp.linalg.norm(normals, axis=1, keepdims=True), fields
+
+
+def _more_rows(on: np.ndarray, added: int, capacity: int | None) -> int:
+    """By how much arrays are to grow."""
+    needed, rows = int(on.sum()) + added, len(on)
+    if capacity is not None and needed > capacity:
+        raise ValueError(f"the spacing wanted needs {needed} points, the capacity is {capacity}")
+    if capacity is not None:
+        return max(0, capacity - rows)
+    return 0 if needed <= rows else max(needed, math.ceil(_GROWTH * rows)) - rows
+
+
+def _widened(lists: Neighbors, k: int) -> Neighbors:
+    """With as many slots."""
+    more = ((0, 0), (0, max(0, k - lists.k)))
+    indices = np.where(
+        np.pad(lists.mask, more), np.pad(lists.indices, more), np.arange(lists.n)[:, None]
+    )
+    return Neighbors(jnp.asarray(indices.astype(np.int32)), jnp.asarray(np.pad(lists.mask, more)))
+
+
+def _put(rows: np.ndarray, count: int, old: Array, new: Array) -> Array:
+    """Some rows replaced, in an array that gets more rows like its first."""
+    longer = jnp.broadcast_to(old[:1], (count - len(old), *old.shape[1:]))
+    return jnp.concatenate([old, longer]).at[rows].set(new)

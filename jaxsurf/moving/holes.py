@@ -1,0 +1,156 @@
+"""Holes in a cloud: large empty circles, and where points in them go."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from ..cloud import PointCloud
+from ..frames import frames_of
+from ..neighbors import Neighbors
+
+# Numbers held together: points times pairs of neighbours.
+_BATCH = 1 << 18
+# Of a circle's squared radius: what a point on it may be off, as on even grids; and of areas.
+_ROUNDOFF = 1e-6
+
+
+def large_triangles(
+    cloud: PointCloud, neighbors: Neighbors, radius: Float[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, "m 3"], Float[np.ndarray, "m d"]]:
+    """Corners and circumcentres of triangles whose circumcircle is empty, larger than the radius at
+    one corner, and has its centre inside.
+
+    Surfaces in space. Circles lie in the tangent plane of that corner, and are empty as far as its
+    list tells; of those that reach farther the centre is moved towards the corner, so that the part
+    that is known to be empty is what is returned.
+
+    Source: after paper 002, Section 3.3.2.
+    """
+    x, frames = np.asarray(cloud.points, float), frames_of(np.asarray(cloud.normals, float))
+    indices, mask = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
+    first, second = np.triu_indices(indices.shape[1] - 1, 1)
+    rows = np.flatnonzero(cloud.host_active)
+    corners, centers = [np.zeros((0, 3), int)], [np.zeros((0, x.shape[1]))]
+    for row in np.array_split(rows, 1 + len(rows) * len(first) // _BATCH):
+        around, on = indices[row, 1:], mask[row, 1:]
+        q = np.einsum("btd,bkd->bkt", frames[row, :2], x[around] - x[row, None])
+        center = _circles(q, on, radius[row], first, second)
+        point, pair = np.nonzero(np.isfinite(center[..., 0]))
+        center, known = center[point, pair], np.max(np.where(on, np.sum(q**2, 2), 0), 1)[point]
+        inside = np.sum(q[point] ** 2, 2) - 2 * np.einsum("mkt,mt->mk", q[point], center)
+        size = np.sum(center**2, axis=1)
+        empty = np.all((inside >= -_ROUNDOFF * size[:, None]) | ~on[point], axis=1)
+        center = center * np.minimum(1, np.sqrt(known / (4 * size)))[:, None]
+        point, pair, center = point[empty], pair[empty], center[empty]
+        corners.append(
+            np.stack([row[point], around[point, first[pair]], around[point, second[pair]]], axis=1)
+        )
+        centers.append(x[row[point]] + np.einsum("mt,mtd->md", center, frames[row[point], :2]))
+    return np.concatenate(corners), np.concatenate(centers)
+
+
+def _circles(q, on, radius, first, second) -> Float[np.ndarray, "b p 2"]:
+    """Centres of the circles through the origin and two points; NaN where not wanted."""
+    squared = np.sum(q**2, axis=2)
+    a, b, half_a, half_b = q[:, first], q[:, second], squared[:, first] / 2, squared[:, second] / 2
+    area = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    area = np.where(area**2 > _ROUNDOFF**2 * half_a * half_b, area, np.nan)
+    x = (half_a * b[..., 1] - half_b * a[..., 1]) / area
+    y = (half_b * a[..., 0] - half_a * b[..., 0]) / area
+    u, v = (x * b[..., 1] - y * b[..., 0]) / area, (a[..., 0] * y - a[..., 1] * x) / area
+    wanted = (x**2 + y**2 > radius[:, None] ** 2) & on[:, first] & on[:, second]
+    wanted &= (u >= -_ROUNDOFF) & (v >= -_ROUNDOFF) & (u + v <= 1 + _ROUNDOFF)
+    return np.where(wanted[..., None], np.stack([x, y], axis=-1), np.nan)
+
+
+def large_gaps(
+    cloud: PointCloud, neighbors: Neighbors, radius: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "m 2"]:
+    """Middles between points of a plane curve that are farther than twice the radius apart."""
+    x, n = np.asarray(cloud.points, float), np.asarray(cloud.normals, float)
+    indices, mask = np.asarray(neighbors.indices)[:, 1:], np.asarray(neighbors.mask)[:, 1:]
+    tangents = np.stack([n[:, 1], -n[:, 0]], axis=1)
+    along = np.einsum("nkd,nd->nk", x[indices] - x[:, None], tangents)
+    following = np.where(mask & (along > 0), along, np.inf)
+    slot = np.argmin(following, axis=1)
+    rows = np.flatnonzero(cloud.host_active & np.isfinite(np.min(following, axis=1)))
+    other = indices[rows, slot[rows]]
+    wide = np.linalg.norm(x[other] - x[rows], axis=1) > 2 * radius[rows]
+    return (x[rows] + x[other])[wide] / 2
+
+
+def circumcenters(
+    cloud: PointCloud, triangles: Int[np.ndarray, "m 3"], *, corrected: bool = False
+) -> Float[np.ndarray, "m 3"]:
+    """Circumcentres of triangles; corrected, moved along the mean normal.
+
+    Equations 8 and 9 ask that the ways to the corners stand on the corners' normals; so restored
+    they overshoot on a sphere by as much as was missing. Here the ways stand on the sum of that
+    normal and the new one, which is exact for circles.
+
+    Source: after paper 002, equations 8 and 9.
+    """
+    x, normals = np.asarray(cloud.points)[triangles], np.asarray(cloud.normals)[triangles]
+    # The weight of a corner is the squared side across times the cosine of its angle.
+    across = np.roll(x, -1, axis=1) - np.roll(x, 1, axis=1)
+    sides = np.sum(across**2, axis=2)
+    weights = sides * (np.sum(sides, axis=1, keepdims=True) - 2 * sides)
+    center = np.einsum("mc,mcd->md", weights / np.sum(weights, axis=1, keepdims=True), x)
+    if not corrected:
+        return center
+    mean = np.mean(normals, axis=1)
+    normals = normals + mean[:, None]
+    above = np.sum((x - center[:, None]) * normals, axis=(1, 2))
+    return center + (above / np.einsum("md,mcd->m", mean, normals))[:, None] * mean
+
+
+def fillings(
+    cloud: PointCloud, neighbors: Neighbors, radius: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "m d"]:
+    """Points for the holes, in tangent planes: each as far as the radius from all others."""
+    if cloud.dim == 2:
+        at = large_gaps(cloud, neighbors, radius)
+    else:
+        at = large_triangles(cloud, neighbors, radius)[1]
+    rows = np.flatnonzero(cloud.host_active)
+    x = np.asarray(cloud.points, float)[rows]
+    size, nearest = cKDTree(x).query(at)
+    wanted = radius[rows][nearest]
+    # The largest first: the middle of a hole, not a smaller circle at its rim. A centre above the
+    # surface may be nearer to others than to those that it was found from.
+    order = np.argsort(-size / wanted, kind="stable")
+    at, wanted = at[order], wanted[order]
+    return at[_apart(at, wanted)] if len(at) else at
+
+
+def _apart(
+    x: Float[np.ndarray, "m d"], distance: Float[np.ndarray, " m"]
+) -> Bool[np.ndarray, " m"]:
+    """Which points to take, the first ones first, so that all are as far apart."""
+    near = cKDTree(x).query_ball_point(x, distance)
+    kept = np.zeros(len(x), bool)
+    for i, others in enumerate(near):
+        kept[i] = not kept[others].any()
+    return kept
+
+
+def close_pairs(
+    cloud: PointCloud, neighbors: Neighbors, distance: Float[np.ndarray, " n"]
+) -> Int[np.ndarray, "m 2"]:
+    """Neighbours that are closer than the distance, the closest first; no point is in two pairs."""
+    x, indices = np.asarray(cloud.points, float), np.asarray(neighbors.indices)
+    length = np.linalg.norm(x[indices] - x[:, None], axis=2)
+    allowed = np.minimum(distance[indices], distance[:, None])
+    close = np.asarray(neighbors.mask) & (length < allowed) & cloud.host_active[indices]
+    close &= indices > np.arange(len(x))[:, None]
+    i, slot = np.nonzero(close)
+    order = np.argsort(length[i, slot], kind="stable")
+    i, j = i[order], indices[i, slot][order]
+    free, kept = np.ones(len(x), bool), np.zeros(len(i), bool)
+    for pair in range(len(i)):
+        kept[pair] = free[i[pair]] and free[j[pair]]
+        if kept[pair]:
+            free[i[pair]] = free[j[pair]] = False
+    return np.stack([i, j], axis=1)[kept]

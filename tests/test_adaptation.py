@@ -1,0 +1,169 @@
+"""Points added in holes and merged where they crowd."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+import jaxsurf as js
+from jaxsurf.moving import follow
+from jaxsurf.moving.holes import circumcenters, large_triangles
+
+RNG = np.random.default_rng(5)
+METHOD = js.GFDM(degree=4)
+
+
+def on_sphere(x):
+    return x / np.linalg.norm(x, axis=1, keepdims=True)
+
+
+def apart(cloud):
+    return cKDTree(cloud.points).query(cloud.points, 2)[0][:, 1]
+
+
+def farthest(cloud):
+    """Radius of the largest empty ball about a point of the unit sphere, from many of them."""
+    return cKDTree(cloud.points).query(on_sphere(RNG.normal(size=(20_000, 3))))[0].max()
+
+
+def without_some(n):
+    """A sphere without every fiftieth point, its lists, and the spacing that it had."""
+    cloud = js.sphere(n)
+    keep = np.arange(n) % 50 != 25
+    holed = js.PointCloud(cloud.points[keep], cloud.normals[keep])
+    return holed, js.find_neighbors(holed, k=25), np.sqrt(4 * np.pi / n)
+
+
+def test_holes_are_filled_and_crowds_thinned():
+    """An uneven cloud, with neighbours from a fifth of a spacing to nearly two apart."""
+    x = on_sphere(js.sphere(2000).points + RNG.normal(size=(2000, 3)) * 0.025)
+    surface = js.discretize(js.PointCloud(x, x), method=js.GFDM(degree=2))
+    h = 0.08
+    assert farthest(surface.cloud) > 1.1 * h and apart(surface.cloud).min() < 0.3 * h
+    found = js.adapt_points(surface, js.Adaptation(spacing=h), x[:, 2])
+    cloud = found.surface.cloud
+    assert found.added > 10 and found.merged > 100 and cloud.active is None
+    assert cloud.n == surface.n + found.added - found.merged
+    # Empty circles lie in tangent planes, and are flatter than the sphere.
+    assert farthest(cloud) < 0.92 * h
+    assert apart(cloud).min() >= 0.4 * h * (1 - 1e-9)
+    assert np.abs(np.linalg.norm(cloud.points, axis=1) - 1).max() < 1e-3
+    assert np.abs(found.fields - cloud.points[:, 2]).max() < 1e-12
+    # What is as wanted stays as it is.
+    again = js.adapt_points(found.surface, js.Adaptation(spacing=h), found.fields)
+    assert again.surface is found.surface and not again.added + again.merged
+
+
+@pytest.mark.slow
+def test_corrected_points_are_nearer_and_local_surfaces_better():
+    """Equations 8 and 9 in a form that is exact for circles; polynomials, of higher order."""
+    error = []
+    for n in (500, 2000):
+        holed, neighbors, h = without_some(n)
+        triangles, flat = large_triangles(holed, neighbors, np.full(holed.n, 0.9 * h))
+        placed = [circumcenters(holed, triangles, corrected=c) for c in (False, True)]
+        placed.append(
+            js.discretize(holed, neighbors, method=METHOD).interpolate(holed.points, flat)
+        )
+        error.append([np.abs(np.linalg.norm(x, axis=1) - 1).max() for x in placed])
+    plain, corrected, local = np.transpose(error)
+    assert np.all(corrected <= plain / 2)
+    assert np.log2(plain[0] / plain[1]) > 1.8 and np.log2(local[0] / local[1]) > 3.5
+
+
+def test_gaps_of_curves_are_filled():
+    angle = 2 * np.pi * np.arange(60) / 60 + RNG.uniform(-0.049, 0.049, 60)
+    x = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    surface = js.discretize(js.PointCloud(x, x), js.find_neighbors(js.PointCloud(x, x), k=12))
+    found = js.adapt_points(surface, js.Adaptation(spacing=0.08))
+    x = np.asarray(found.surface.cloud.points)
+    gaps = np.diff(np.sort(np.arctan2(x[:, 1], x[:, 0])))
+    assert found.added and found.merged and 0.0319 < gaps.min() and gaps.max() < 0.1445
+    assert np.abs(np.linalg.norm(x, axis=1) - 1).max() < 1e-3
+
+
+@pytest.mark.slow
+def test_spacing_may_follow_the_curvature_and_integrals_stay():
+    surface = js.discretize(js.ellipsoid(1000, (2.0, 1.0, 1.0)), method=METHOD)
+
+    def spacing(t, surface, fields, args):
+        assert t == 3.0 and fields[1].shape == (1000, 2)
+        return args / surface.mean_curvature
+
+    x = surface.cloud.points
+    fields = (jnp.exp(x[:, 0]), x[:, 1:] ** 2)
+    adaptation = js.Adaptation(spacing, conserve=True)
+    found = js.adapt_points(surface, adaptation, fields, t=3.0, args=0.15)
+    cloud, curvature = found.surface.cloud, np.asarray(found.surface.mean_curvature)
+    wanted = 0.15 / curvature
+    assert wanted.max() > 2.5 * wanted.min()
+    # Between the bounds, but for what the spacing changes from one neighbour to the next.
+    assert np.all(apart(cloud) > 0.35 * wanted) and np.all(apart(cloud) < 1.8 * wanted)
+    for u, before in zip(found.fields, fields):
+        np.testing.assert_allclose(
+            found.surface.integrate(u), surface.integrate(before), rtol=1e-12
+        )
+    u, x = found.fields[0], cloud.points
+    assert float(jnp.abs(u - jnp.exp(x[:, 0])).max()) < 1e-2
+
+
+def growing(t, surface, fields, args):
+    return args * surface.cloud.normals
+
+
+@pytest.mark.slow
+def test_points_are_added_while_a_sphere_grows(tmp_path, monkeypatch):
+    """With room for all nothing compiles twice; a run that was killed ends in the same bits."""
+    start = js.sphere(300)
+    adaptation = js.Adaptation(spacing=0.22, capacity=700)
+
+    def run(name):
+        given = dict(checkpoint=js.Checkpoint(tmp_path / name, every=0.5), saveat=[0.0, 0.4])
+        given |= dict(fields=start.points[:, 2], adapt=adaptation, method=js.GFDM(degree=2))
+        return js.evolve(js.Motion(growing), start, t1=1.0, args=0.5, **given)
+
+    whole = run("whole")
+    assert whole.clouds[0].n == 300 and whole.clouds[-1].n > 450
+    for cloud, u, radius in zip(whole.clouds, whole.fields, (1.0, 1.2, 1.5)):
+        np.testing.assert_allclose(np.linalg.norm(cloud.points, axis=1), radius, atol=2e-3)
+        np.testing.assert_allclose(u, cloud.points[:, 2] / radius, atol=2e-3)
+        assert cloud.active is None and apart(cloud).max() < 1.8 * 0.22
+    events = whole.history["events"]
+    assert 300 + events["added"].sum() - events["merged"].sum() == whole.clouds[-1].n
+    assert np.all(np.diff(events["t"]) > 0) and whole.history["n"][-1] == whole.clouds[-1].n
+
+    class Killed(Exception):
+        pass
+
+    def write_and_die(*content):
+        written(*content)
+        raise Killed
+
+    written = follow.written
+    monkeypatch.setattr(follow, "written", write_and_die)
+    with pytest.raises(Killed):
+        run("killed")
+    monkeypatch.undo()
+    again = run("killed")
+    np.testing.assert_array_equal(again.changes, whole.changes)
+    for one, other in zip(again.clouds, whole.clouds, strict=True):
+        np.testing.assert_array_equal(one.points, other.points)
+
+
+def test_in_single_precision():
+    sphere = js.sphere(200)
+    x = sphere.points.astype(jnp.float32)
+    surface = js.discretize(js.PointCloud(x, x), method=js.GFDM(degree=2))
+    found = js.adapt_points(surface, js.Adaptation(spacing=0.2), x[:, 2])
+    exact = js.adapt_points(js.discretize(sphere, method=surface.method), js.Adaptation(0.2))
+    assert found.added and found.surface.cloud.points.dtype == jnp.float32
+    off = [np.abs(np.linalg.norm(f.surface.cloud.points, axis=1) - 1).max() for f in (found, exact)]
+    assert abs(off[0] - off[1]) < 1e-5
+    assert np.abs(found.fields - found.surface.cloud.points[:, 2]).max() < 1e-5
+
+
+@pytest.mark.slow
+def test_an_error_says_how_many_points_are_needed():
+    surface = js.discretize(js.sphere(200), method=js.GFDM(degree=2))
+    with pytest.raises(ValueError, match=r"needs \d+ points, the capacity is 250"):
+        js.adapt_points(surface, js.Adaptation(spacing=0.1, capacity=250))

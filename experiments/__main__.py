@@ -48,9 +48,17 @@ EXPERIMENTS = {
         "Diffusion over a bump against fine surface finite elements (paper 001, Figs. 5, 6)",
     ),
     "E9": ("e09_rotation", "A quarter of a sphere turns once, three moves (paper 002, Fig. 5)"),
+    "E12": (
+        "e12_added_points",
+        "Points added on sphere and torus, three placings (paper 002, Section 3.7.2)",
+    ),
     "E13": (
         "e13_expanding_sphere",
         "Heat with a source on the expanding sphere, errors of space (paper 002, Table 2)",
+    ),
+    "E14": (
+        "e14_steps",
+        "Heat with a source on the expanding sphere, errors of time (paper 002, Table 3)",
     ),
     "E18": (
         "e18_expanding_wave",

@@ -339,7 +339,7 @@ def carried(c: Case):
 
 def thinned(c: Case):
     """Sums over all points: those put into holes take the first rows that are free."""
-    found = js.adapt_points(c.surface, js.Adaptation(0.35, hole=0.75), c.u)
+    found = js.adapt_points(c.surface, js.Adaptation(0.25, hole=0.8), c.u)
     of_all = lambda x: jnp.sum(jnp.abs(x), axis=0)
     sums = of_all(found.surface.cloud.points), of_all(found.fields)
     return jnp.array([found.added, found.merged], float), *sums

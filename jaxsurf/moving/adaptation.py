@@ -170,7 +170,8 @@ def adapt_points(
     spacing = adaptation.at(t, surface, fields, args)
     cloud, _, new, added, merged = changed(surface, fields, adaptation, spacing)
     if not added + merged:
-        return Adapted(surface, fields, 0, 0)
+        kept = (surface, fields) if surface.cloud.active is None else compact(surface, fields)
+        return Adapted(*kept, 0, 0)
     on = np.flatnonzero(cloud.host_active)
     after = discretize(PointCloud(cloud.points[on], cloud.normals[on]), method=surface.method)
     new = jax.tree.map(lambda u: u[on], new)

@@ -177,6 +177,10 @@ def evolve(
     on = surface.cloud.active
     field = lambda u: finite(switched_off(on, as_float(u, "fields", (n, ...))), "fields")
     fields = jax.tree.map(field, fields)
+    concrete = is_concrete(surface, fields, args, t0, t1)
+    for name, value in (("adapt", adapt), ("checkpoint", checkpoint)):
+        if value is not None and not concrete:
+            raise ValueError(f"{name} needs concrete arrays: it is the host that looks at them")
     if adapt is not None:
         surface, fields = _with_rows(surface, fields, adapt)
     times = _times(t0, t1, saveat)
@@ -191,14 +195,8 @@ def evolve(
     moving, state = Moving.of(surface, motion, problem), joined(surface.cloud.points, fields)
     if checkpoint is not None:
         instance(checkpoint, Checkpoint, "checkpoint", "js.Checkpoint(path, every=...)")
-    if is_concrete(surface, fields, args, t0, t1):
+    if concrete:
         return Evolution(*followed(moving, state, t0, times, options, adapt, checkpoint, progress))
-    if adapt is not None:
-        raise ValueError(
-            "adapt needs concrete arrays: which points there are is decided on the host"
-        )
-    if checkpoint is not None:
-        raise ValueError("a checkpoint needs concrete arrays: it is written by the host")
     return _kept(moving, state, t0, times, options)
 
 

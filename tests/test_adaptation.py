@@ -167,3 +167,33 @@ def test_an_error_says_how_many_points_are_needed():
     surface = js.discretize(js.sphere(200), method=js.GFDM(degree=2))
     with pytest.raises(ValueError, match=r"needs \d+ points, the capacity is 250"):
         js.adapt_points(surface, js.Adaptation(spacing=0.1, capacity=250))
+
+
+@pytest.mark.slow
+def test_borders_stay_and_their_gaps_are_filled():
+    """Of a zone of the sphere: at its ends there are only border points around, and no holes."""
+    latitude = np.linspace(-np.pi / 6, np.pi / 6, 13)
+    rings = [
+        (np.arange(70) + 0.5 * (i % 2)) * 2 * np.pi / 70 + 0 * a for i, a in enumerate(latitude)
+    ]
+    lat, lon = np.repeat(latitude, 70), np.concatenate(rings)
+    x = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
+    marked = np.repeat(np.abs(np.arange(13) - 6) == 6, 70)
+    there = ~marked | (np.arange(len(x)) % 9 > 1)
+    x, marked = x[there], marked[there]
+    surface = js.discretize(js.PointCloud(x, x, boundary=marked), method=METHOD)
+    for h in (0.06, 0.25):
+        found = js.adapt_points(surface, js.Adaptation(h), x[:, 2])
+        cloud = found.surface.cloud
+        y, on = np.asarray(cloud.points), np.asarray(cloud.boundary)
+        assert np.abs(np.linalg.norm(y, axis=1) - 1).max() < 1e-5
+        assert np.abs(np.abs(y[on, 2]) - 0.5).max() < 1e-5 and np.abs(y[~on, 2]).max() < 0.5
+        np.testing.assert_allclose(found.fields, y[:, 2], atol=1e-5)
+        along = [np.diff(np.sort(np.arctan2(*y[on & (s * y[:, 2] > 0), :2].T))) for s in (1, -1)]
+        gaps = 2 * np.cos(np.pi / 6) * np.sin(np.concatenate(along) / 2)
+        assert gaps.max() < 1.8 * h and gaps.min() > 0.39 * h
+        assert apart(cloud).min() >= 0.4 * h * (1 - 1e-9)
+        # Where the border lost no point it has all of its own.
+        kept = cKDTree(y[on]).query(x[marked])[0] < 1e-12
+        assert found.merged or kept.all()
+        assert found.added > 100 or found.merged

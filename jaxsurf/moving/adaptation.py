@@ -11,15 +11,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from ..arguments import as_float, finite, instance, real, switched_off, whole
+from ..borders.border import Border
+from ..borders.order import find_border
 from ..cloud import PointCloud
 from ..discretization import Discretization, discretize
 from ..failures import needs_values, raise_at
 from ..interpolation import interpolated, nearest_points
 from ..neighbors import Neighbors, find_neighbors
-from .holes import close_pairs, fillings
+from .holes import border_gaps, close_pairs, fillings
 
 # Each round fills the largest holes that do not touch, so the number of points may triple in it.
 _ROUNDS = 30
@@ -35,7 +37,8 @@ class Adaptation(eqx.Module):
     A hole is an empty circle through points whose centre is inside their triangle (on plane curves
     a gap). A point goes into each, on the local polynomial surface of the operators' degree; two
     points that are too close become one between them. Fields are interpolated by the same
-    polynomials. Surfaces without borders.
+    polynomials. Points of a border stay where they are, and new ones go into its gaps, on the curve
+    through those that there are.
 
     Args:
         spacing: distance h between neighbours, in length: a cloud has about area / h² points. A
@@ -135,7 +138,7 @@ def adapt_points(
     r"""Add and merge points until no hole and no crowd is left.
 
     Args:
-        surface: from `discretize`, without a border.
+        surface: from `discretize`.
         adaptation: the spacing wanted.
         fields: on the surface, `(n, *c)`, or several as a tuple.
         t, args: handed to a spacing that is a function.
@@ -149,7 +152,7 @@ def adapt_points(
     Not differentiable: which points there are is decided on the host.
     Raises:
         TypeError: arguments of other kinds.
-        ValueError: a surface with a border or traced; fields of another shape or not finite; more
+        ValueError: a traced surface; fields of another shape or not finite; more
             points than the capacity; holes that are left after 30 rounds.
     Source: as `Adaptation`.
 
@@ -168,13 +171,12 @@ def adapt_points(
     )
     fields = jax.tree.map(field, fields)
     spacing = adaptation.at(t, surface, fields, args)
-    cloud, _, new, added, merged = changed(surface, fields, adaptation, spacing)
+    after, new, added, merged = changed(surface, fields, adaptation, spacing)
     if not added + merged:
         kept = (surface, fields) if surface.cloud.active is None else compact(surface, fields)
         return Adapted(*kept, 0, 0)
-    on = np.flatnonzero(cloud.host_active)
-    after = discretize(PointCloud(cloud.points[on], cloud.normals[on]), method=surface.method)
-    new = jax.tree.map(lambda u: u[on], new)
+    after, new = compact(after, new)
+    after = discretize(after.cloud, method=surface.method)
     if adaptation.conserve:
         new = conserved(surface, fields, after, new)
     return Adapted(after, new, added, merged)
@@ -184,11 +186,6 @@ def checked_adaptation(adaptation: Any, surface: Discretization) -> None:
     """Refuse what is none, and surfaces that it cannot serve."""
     instance(adaptation, Adaptation, "adapt", "js.Adaptation(spacing=...)")
     needs_values("the surface whose points are adapted", surface)
-    if surface.border is not None:
-        raise ValueError(
-            f"the surface has {len(surface.border.points)} points on its border: points are added "
-            "and merged on surfaces without borders only"
-        )
 
 
 def changed(
@@ -196,35 +193,64 @@ def changed(
     fields: PyTree[Array],
     adaptation: Adaptation,
     spacing: Float[np.ndarray, " n"],
-) -> tuple[PointCloud, Neighbors, PyTree[Array], int, int]:
-    """Points and fields, their arrays longer if need be, and lists of the usual size."""
-    cloud, neighbors = surface.cloud, surface.neighbors
-    degree, k = surface.method.polynomial_degree, surface.method.neighbor_count(cloud.dim)
+) -> tuple[Discretization, PyTree[Array], int, int]:
+    """A surface with lists of the usual size and its fields, in longer arrays if need be."""
+    cloud, neighbors, border = surface.cloud, surface.neighbors, surface.border
+    method, rank = surface.method, _ranks(surface)
+    degree, k = method.polynomial_degree, method.neighbor_count(cloud.dim)
     added = merged = 0
     for _ in range(_ROUNDS):
-        pairs = close_pairs(cloud, neighbors, adaptation.closest * spacing)
+        x = np.asarray(cloud.points)
+        pairs = close_pairs(cloud, neighbors, adaptation.closest * spacing, rank)
         holes = fillings(cloud, neighbors, adaptation.hole * spacing)
-        if not len(pairs) + len(holes):
-            return cloud, neighbors, fields, added, merged
-        added, merged = added + len(holes), merged + len(pairs)
-        at = np.concatenate([np.mean(np.asarray(cloud.points)[pairs], axis=1), holes])
+        feet, normals_there = _on_border(cloud, border, adaptation.hole * spacing)
+        new = np.concatenate([feet, holes])
+        if not len(pairs) + len(new):
+            return Discretization(cloud, neighbors, method, border), fields, added, merged
+        added, merged = added + len(new), merged + len(pairs)
+        # What is on a border stays where it is.
+        stays = rank[pairs[:, :1]] > 0
+        kept = np.where(stays, x[pairs[:, 0]], np.mean(x[pairs], axis=1))
+        at, edge = np.concatenate([kept, new]), slice(len(pairs), len(pairs) + len(feet))
         arrays = (cloud.points, cloud.normals, fields)
-        values = _interpolated(cloud, neighbors, degree, at, arrays)
+        points, normals, values = _interpolated(cloud, neighbors, degree, at, arrays)
+        values = (points.at[edge].set(feet), normals.at[edge].set(normals_there), values)
         wanted = spacing[np.asarray(nearest_points(cloud.points, cloud.active, jnp.asarray(at)))]
         on = np.array(cloud.host_active)
         on[pairs[:, 1]] = False
-        on = np.append(on, np.zeros(_more_rows(on, len(holes), adaptation.capacity), bool))
-        rows = np.append(pairs[:, 0], np.flatnonzero(~on)[: len(holes)])
-        on[rows], spacing = True, np.append(spacing, np.ones(len(on) - len(spacing)))
-        spacing[rows] = wanted
+        on = np.append(on, np.zeros(_more_rows(on, len(new), adaptation.capacity), bool))
+        rows = np.append(pairs[:, 0], np.flatnonzero(~on)[: len(new)])
+        more = len(on) - len(spacing)
+        on[rows], spacing, rank = True, np.pad(spacing, (0, more)), np.pad(rank, (0, more))
+        spacing[rows], rank[rows[len(pairs) :]] = wanted, 0
+        rank[rows[edge]] = 1
         put = functools.partial(_put, rows, len(on))
         points, normals, fields = jax.tree.map(put, arrays, values)
-        cloud = PointCloud(points, normals, active=jnp.asarray(on))
+        marked = None if border is None else jnp.asarray((rank > 0) & on)
+        cloud = PointCloud(points, normals, active=jnp.asarray(on), boundary=marked)
         neighbors = _widened(find_neighbors(cloud, k), surface.neighbors.k)
+        border = None if border is None else find_border(cloud)
     raise ValueError(
-        f"{len(holes)} holes and {len(pairs)} crowded pairs of points are left after {_ROUNDS} "
+        f"{len(new)} holes and {len(pairs)} crowded pairs of points are left after {_ROUNDS} "
         "rounds: the spacing wanted may change too much between neighbours"
     )
+
+
+def _ranks(surface: Discretization) -> Int[np.ndarray, " n"]:
+    """0 of points inside, 1 on the border, 2 at corners: which of two stays."""
+    rank, border = np.zeros(surface.n, int), surface.border
+    if border is not None:
+        points = np.asarray(border.points)
+        corners = border.corners if surface.cloud.dim == 3 else np.ones(len(points), bool)
+        rank[points] = 1 + corners
+    return rank
+
+
+def _on_border(cloud: PointCloud, border: Border | None, radius):
+    """Points for the gaps of a border, and their normals."""
+    if border is None or cloud.dim == 2:
+        return np.zeros((0, cloud.dim)), np.zeros((0, cloud.dim))
+    return border_gaps(cloud, border, radius)
 
 
 def compact(surface: Discretization, fields: PyTree[Array]) -> tuple[Discretization, PyTree[Array]]:
@@ -233,9 +259,15 @@ def compact(surface: Discretization, fields: PyTree[Array]) -> tuple[Discretizat
     on = np.flatnonzero(cloud.host_active)
     row = np.zeros(cloud.n, np.int32)
     row[on] = np.arange(len(on))
-    cloud = PointCloud(cloud.points[on], cloud.normals[on])
+    marked = None if cloud.boundary is None else cloud.boundary[on]
+    border = surface.border
+    if border is not None:
+        renamed = lambda names: jnp.asarray(row[np.asarray(names)])
+        border = Border(renamed(border.points), renamed(border.rows), border.mask)
+    cloud = PointCloud(cloud.points[on], cloud.normals[on], boundary=marked)
     lists = Neighbors(jnp.asarray(row[np.asarray(lists.indices)[on]]), lists.mask[on])
-    return Discretization(cloud, lists, surface.method), jax.tree.map(lambda u: u[on], fields)
+    fields = jax.tree.map(lambda u: u[on], fields)
+    return Discretization(cloud, lists, surface.method, border), fields
 
 
 def conserved(before: Discretization, old, after: Discretization, new) -> PyTree[Array]:

@@ -217,7 +217,9 @@ def _with_rows(
     room = max(0, (adapt.capacity or 0) - surface.n)
     on = jnp.pad(jnp.asarray(surface.cloud.host_active), (0, room))
     more = lambda u: jnp.pad(u, ((0, room), *((0, 0),) * (u.ndim - 1)))
-    cloud = PointCloud(more(surface.cloud.points), more(surface.cloud.normals), active=on)
+    cloud, marked = surface.cloud, surface.cloud.boundary
+    marked = None if marked is None else jnp.pad(marked, (0, room))
+    cloud = PointCloud(more(cloud.points), more(cloud.normals), active=on, boundary=marked)
     return discretize(cloud, method=surface.method), jax.tree.map(more, fields)
 
 

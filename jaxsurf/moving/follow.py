@@ -233,13 +233,13 @@ class _Run:
         surface = self.moving.surface if surface is None else surface
         fields = parted(self.state)[1]
         spacing = self.adapt.at(self.t, surface, fields, self.options["args"])
-        cloud, lists, new, *count = changed(surface, fields, self.adapt, spacing)
+        after, new, *count = changed(surface, fields, self.adapt, spacing)
         if not any(count):
             return False
-        self.begin(Discretization(cloud, lists, surface.method))
+        self.begin(after)
         if self.adapt.conserve:
             new = conserved(surface, fields, self.moving.surface, new)
-        self.state = joined(cloud.points, new)
+        self.state = joined(after.cloud.points, new)
         self.changes = np.append(self.changes, [[float(self.t), *count]], axis=0)
         return True
 

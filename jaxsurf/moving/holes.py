@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
+from ..borders.border import Border
 from ..cloud import PointCloud
 from ..frames import frames_of
 from ..neighbors import Neighbors
@@ -67,8 +69,8 @@ def _circles(q, on, radius, first, second) -> Float[np.ndarray, "b p 2"]:
 
 def large_gaps(
     cloud: PointCloud, neighbors: Neighbors, radius: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "m 2"]:
-    """Middles between points of a plane curve that are farther than twice the radius apart."""
+) -> tuple[Int[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
+    """Neighbours on a plane curve that are farther than twice the radius apart, and the middles."""
     x, n = np.asarray(cloud.points, float), np.asarray(cloud.normals, float)
     indices, mask = np.asarray(neighbors.indices)[:, 1:], np.asarray(neighbors.mask)[:, 1:]
     tangents = np.stack([n[:, 1], -n[:, 0]], axis=1)
@@ -76,9 +78,24 @@ def large_gaps(
     following = np.where(mask & (along > 0), along, np.inf)
     slot = np.argmin(following, axis=1)
     rows = np.flatnonzero(cloud.host_active & np.isfinite(np.min(following, axis=1)))
-    other = indices[rows, slot[rows]]
-    wide = np.linalg.norm(x[other] - x[rows], axis=1) > 2 * radius[rows]
-    return (x[rows] + x[other])[wide] / 2
+    pairs = np.stack([rows, indices[rows, slot[rows]]], axis=1)
+    ends = x[pairs]
+    wide = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > 2 * radius[rows]
+    return pairs[wide], ends[wide].mean(axis=1)
+
+
+def border_gaps(
+    cloud: PointCloud, border: Border, radius: Float[np.ndarray, " n"]
+) -> tuple[Float[Array, "m 3"], Float[Array, "m 3"]]:
+    """Points of a border, and normals there, between two that are farther than twice the radius."""
+    rows, mask = np.asarray(border.rows)[1], np.asarray(border.mask)[1]
+    own = np.argmax(mask & (rows == np.asarray(border.points)[:, None]), axis=1)
+    slot = np.flatnonzero(own + 1 < mask.sum(axis=1))
+    ends = np.stack([rows[slot, own[slot]], rows[slot, own[slot] + 1]])
+    x = np.asarray(cloud.points)[ends]
+    wide = np.linalg.norm(x[1] - x[0], axis=1) > 2 * radius[ends].min(axis=0)
+    foot, normal, *_ = border.at(cloud, 1, jnp.asarray(slot[wide]), jnp.asarray(x.mean(0)[wide]))
+    return foot, normal
 
 
 def circumcenters(
@@ -109,11 +126,14 @@ def circumcenters(
 def fillings(
     cloud: PointCloud, neighbors: Neighbors, radius: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "m d"]:
-    """Points for the holes, in tangent planes: each as far as the radius from all others."""
-    if cloud.dim == 2:
-        at = large_gaps(cloud, neighbors, radius)
-    else:
-        at = large_triangles(cloud, neighbors, radius)[1]
+    """Points for the holes, in tangent planes: each as far as the radius from all others.
+
+    What has only points of borders around it is no hole but where the surface ends.
+    """
+    find = large_gaps if cloud.dim == 2 else large_triangles
+    around, at = find(cloud, neighbors, radius)
+    if cloud.boundary is not None:
+        at = at[~np.asarray(cloud.boundary)[around].all(axis=1)]
     rows = np.flatnonzero(cloud.host_active)
     x = np.asarray(cloud.points, float)[rows]
     size, nearest = cKDTree(x).query(at)
@@ -137,9 +157,15 @@ def _apart(
 
 
 def close_pairs(
-    cloud: PointCloud, neighbors: Neighbors, distance: Float[np.ndarray, " n"]
+    cloud: PointCloud,
+    neighbors: Neighbors,
+    distance: Float[np.ndarray, " n"],
+    rank: Int[np.ndarray, " n"],
 ) -> Int[np.ndarray, "m 2"]:
-    """Neighbours that are closer than the distance, the closest first; no point is in two pairs."""
+    """Neighbours that are closer than the distance, the closest first; no point is in two pairs.
+
+    The first of a pair is that of the higher rank.
+    """
     x, indices = np.asarray(cloud.points, float), np.asarray(neighbors.indices)
     length = np.linalg.norm(x[indices] - x[:, None], axis=2)
     allowed = np.minimum(distance[indices], distance[:, None])
@@ -153,4 +179,5 @@ def close_pairs(
         kept[pair] = free[i[pair]] and free[j[pair]]
         if kept[pair]:
             free[i[pair]] = free[j[pair]] = False
-    return np.stack([i, j], axis=1)[kept]
+    pairs = np.stack([i, j], axis=1)[kept]
+    return np.where(rank[pairs[:, :1]] >= rank[pairs[:, 1:]], pairs, pairs[:, ::-1])

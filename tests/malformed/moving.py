@@ -31,14 +31,6 @@ def evolve(motion=None, cloud=None, **options):
     return js.evolve(motion, surface() if cloud is None else cloud, **({"t1": 1.0} | options))
 
 
-def half() -> js.Discretization:
-    """A half circle in the plane."""
-    angle = np.linspace(0, np.pi, 20)
-    x = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    cloud = js.PointCloud(x, x, boundary=np.isin(np.arange(20), (0, 19)))
-    return js.discretize(cloud, js.find_neighbors(cloud, k=9))
-
-
 def heat(surface):
     return js.AdvectionDiffusionReaction(surface.laplacian)
 
@@ -62,7 +54,6 @@ CALLS = [
     ("evolve", "a checkpoint in compiled code", lambda: jax.jit(lambda a: evolve(args=a, checkpoint=js.Checkpoint("run.npz", every=1.0)).ts)(1.0), ("checkpoint", "host")),
     ("evolve", "a spacing in place of an adaptation", lambda: evolve(adapt=0.1), ("adapt", "0.1", "js.Adaptation")),
     ("evolve", "points adapted in compiled code", lambda: jax.jit(lambda a: evolve(args=a, adapt=js.Adaptation(0.3)).ts)(1.0), ("adapt", "host")),
-    ("evolve", "points adapted where there is a border", lambda: evolve(cloud=half(), adapt=js.Adaptation(0.3)), ("border", "points")),
     ("evolve", "a spacing that is negative somewhere", lambda: evolve(adapt=js.Adaptation(lambda t, s, f, a: s.cloud.points[:, 2])), ("spacing", "point", "positive")),
     ("Adaptation", "no spacing", lambda: js.Adaptation(0.0), ("spacing", "0")),
     ("Adaptation", "a spacing as text", lambda: js.Adaptation("0.1"), ("spacing", "0.1")),
@@ -73,7 +64,6 @@ CALLS = [
     ("adapt_points", "a number", lambda: js.adapt_points(surface(), 0.3), ("adapt", "0.3", "js.Adaptation")),
     ("adapt_points", "fields of others", lambda: js.adapt_points(surface(), js.Adaptation(0.3), jnp.ones(70)), ("fields", "(70,)", "60")),
     ("adapt_points", "a spacing for others", lambda: js.adapt_points(surface(), js.Adaptation(lambda t, s, f, a: jnp.ones(70))), ("spacing", "(70,)", "60")),
-    ("adapt_points", "a border", lambda: js.adapt_points(half(), js.Adaptation(0.3)), ("border", "points")),
     ("evolve", "a tolerance of one", lambda: evolve(rtol=1.0), ("rtol", "1")),
     ("Motion", "an array", lambda: js.Motion(np.ones((N, 3))), ("velocity", "ndarray", "function")),
     ("Motion", "nothing", lambda: js.Motion(None), ("velocity", "None", "function")),

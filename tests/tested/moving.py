@@ -14,7 +14,8 @@ _SHRUNK = _M + "test_a_sphere_shrinks_by_its_curvature"
 _A = "test_adaptation.py::"
 _FILLED = (
     f"{_A}test_holes_are_filled_and_crowds_thinned, {_A}test_gaps_of_curves_are_filled, "
-    f"{_A}test_spacing_may_follow_the_curvature_and_integrals_stay"
+    f"{_A}test_spacing_may_follow_the_curvature_and_integrals_stay, "
+    f"{_A}test_borders_stay_and_their_gaps_are_filled"
 )
 _CHOSEN = "(which points there are is decided on the host)"
 

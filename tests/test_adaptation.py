@@ -191,7 +191,7 @@ def test_borders_stay_and_their_gaps_are_filled():
         np.testing.assert_allclose(found.fields, y[:, 2], atol=1e-5)
         along = [np.diff(np.sort(np.arctan2(*y[on & (s * y[:, 2] > 0), :2].T))) for s in (1, -1)]
         gaps = 2 * np.cos(np.pi / 6) * np.sin(np.concatenate(along) / 2)
-        assert gaps.max() < 1.8 * h and gaps.min() > 0.39 * h
+        assert gaps.max() < 1.57 * h and gaps.min() > 0.39 * h
         assert apart(cloud).min() >= 0.4 * h * (1 - 1e-9)
         # Where the border lost no point it has all of its own.
         kept = cKDTree(y[on]).query(x[marked])[0] < 1e-12

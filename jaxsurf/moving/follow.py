@@ -203,11 +203,10 @@ class _Run:
 
     def renew(self) -> None:
         """Normals and neighbours found anew, and points adapted."""
-        surface, moved = self.moving.surface, self.moving.surface_at(self.state[0])
-        normals, degree = moved.cloud.normals, surface.method.polynomial_degree
-        points = moved.cloud.points
-        normals = refit_normals(points, normals, surface.neighbors, degree=degree)
-        cloud = eqx.tree_at(lambda c: c.normals, moved.cloud, normals)
+        surface, cloud = self.moving.surface, self.moving.cloud_at(self.state[0])
+        degree = surface.method.polynomial_degree
+        normals = refit_normals(cloud.points, cloud.normals, surface.neighbors, degree=degree)
+        cloud = eqx.tree_at(lambda c: c.normals, cloud, normals)
         if self.search is None:
             self.search = surface.search()
         surface = Discretization(cloud, surface.neighbors, surface.method, surface.border)

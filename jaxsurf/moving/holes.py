@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -87,13 +89,16 @@ def large_gaps(
 def border_gaps(
     cloud: PointCloud, border: Border, radius: Float[np.ndarray, " n"]
 ) -> tuple[Float[Array, "m 3"], Float[Array, "m 3"]]:
-    """Points of a border, and normals there, between two that are farther than twice the radius."""
+    """Points of a border, and normals there, in its gaps.
+
+    They are longer than the side of an equilateral triangle whose corners are on such a circle.
+    """
     rows, mask = np.asarray(border.rows)[1], np.asarray(border.mask)[1]
     own = np.argmax(mask & (rows == np.asarray(border.points)[:, None]), axis=1)
     slot = np.flatnonzero(own + 1 < mask.sum(axis=1))
     ends = np.stack([rows[slot, own[slot]], rows[slot, own[slot] + 1]])
     x = np.asarray(cloud.points)[ends]
-    wide = np.linalg.norm(x[1] - x[0], axis=1) > 2 * radius[ends].min(axis=0)
+    wide = np.linalg.norm(x[1] - x[0], axis=1) > math.sqrt(3) * radius[ends].min(axis=0)
     foot, normal, *_ = border.at(cloud, 1, jnp.asarray(slot[wide]), jnp.asarray(x.mean(0)[wide]))
     return foot, normal
 

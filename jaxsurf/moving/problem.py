@@ -11,9 +11,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from ..arguments import as_float, switched_off
+from ..cloud import PointCloud
 from ..discretization import Discretization
 from ..functions import numbers_as_arrays
-from ..motion import carried
+from ..motion import carried, moved_cloud
 from ..stencils.algebra import AbstractOperator
 from ..stencils.stencil import Stencil
 from ..time.explicit import RKC2
@@ -47,13 +48,25 @@ class Moving(AbstractEvolution):
 
     def surface_at(self, points: Array) -> Discretization:
         """The surface with its points elsewhere."""
+        return self.surface.moved(points, self._normals(points))
+
+    def cloud_at(self, points: Array) -> PointCloud:
+        """Its cloud, where neighbours are to be found anew: those there were need not serve."""
+        return moved_cloud(self.surface.cloud, points, self._normals(points), lambda: self.gradient)
+
+    def _normals(self, points: Array) -> Array:
         before = self.surface.cloud
         normals = carried(self.gradient, before.normals, before.points, points)[0]
-        return self.surface.moved(points, switched_off(self.active, normals, before.normals))
+        return switched_off(self.active, normals, before.normals)
 
     @property
     def active(self):
         return self.surface.cloud.active
+
+    @property
+    def operators(self):
+        """Those of the fields are those of their own problem; points go where they are taken."""
+        return [self.gradient] if self.motion.stiff else []
 
     def suggested_solver(self):
         if self.motion.stiff:

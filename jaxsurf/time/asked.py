@@ -15,7 +15,6 @@ from jaxtyping import Array, PyTree
 from ..arguments import as_float, real
 from ..boundary import check_border
 from ..failures import check, is_concrete, not_finite, raise_at
-from ..stencils.algebra import AbstractOperator
 from .higher import WaveEquation
 from .problem import AbstractEvolution
 from .states import dtype_of, only_on
@@ -148,9 +147,8 @@ def check_coefficients(problem: AbstractEvolution, t0, t1) -> None:
         ValueError: a diffusivity that is negative at the start or at the end; a border about which
             nothing is said.
     """
-    for name, operator in vars(problem).items():
-        if isinstance(operator, AbstractOperator) and name != "stabilization":
-            check_border(operator, problem.closure)
+    for operator in problem.operators:
+        check_border(operator, problem.closure)
     if is_concrete(t0, t1):
         problem.check(t0)
         problem.check(t1)

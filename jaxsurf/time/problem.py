@@ -100,6 +100,12 @@ class AbstractEvolution(eqx.Module):
         """What whoever integrates the problem is warned of."""
         return None
 
+    @property
+    def operators(self) -> list[AbstractOperator]:
+        """What needs conditions where there is a border: all that it holds but what stabilises."""
+        held = {name: x for name, x in vars(self).items() if name != "stabilization"}
+        return [x for x in held.values() if isinstance(x, AbstractOperator)]
+
     def check(self, t) -> None:
         """Raise on coefficients that cannot be at time t: those not known when it was made."""
 

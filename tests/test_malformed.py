@@ -14,7 +14,14 @@ from . import malformed
 # What functions return or raise, and classes to be filled out by users.
 MADE_FOR_USERS = (
     {"Diagnostics", "Modes", "IntegrationError", "JacobiPreconditioner", "VCycle"}
-    | {"Spectrum", "Evolution", "TaylorRemainders", "ShapeOptimization", "OptimizationError"}
+    | {
+        "Spectrum",
+        "Evolution",
+        "Adapted",
+        "TaylorRemainders",
+        "ShapeOptimization",
+        "OptimizationError",
+    }
     | {name for name in vars(js) if name.startswith("Abstract")}
 )
 

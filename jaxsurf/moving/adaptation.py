@@ -148,12 +148,13 @@ def adapt_points(
 
     Accuracy: new points are off the surface by $O(h^{p+1})$ with p the degree of the method's
         polynomials, as `Discretization.interpolate` of smooth fields
-        (`tests/test_adaptation.py::test_new_points_are_on_the_surface`); in float32 within 1e-5.
+        (`tests/test_adaptation.py::test_corrected_points_are_nearer_and_local_surfaces_better`);
+        in float32 within 1e-5.
     Not differentiable: which points there are is decided on the host.
     Raises:
         TypeError: arguments of other kinds.
-        ValueError: a traced surface; fields of another shape or not finite; more
-            points than the capacity; holes that are left after 30 rounds.
+        ValueError: a traced surface; fields of another shape or not finite; more points than the
+            capacity; holes that are left after 30 rounds.
     Source: as `Adaptation`.
 
     Example:

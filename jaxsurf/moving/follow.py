@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -216,15 +217,15 @@ class _Run:
 
     def begin(self, surface: Discretization) -> None:
         """On a surface whose lists were found for other points."""
-        cloud = surface.cloud
-        try:
-            if self.search is None:
-                raise ValueError("there is no room")
-            surface = surface.moved(cloud.points, cloud.normals, search=self.search)
-        except ValueError:  # or an error that will be raised again
-            surface = discretize(cloud, method=surface.method)
-            self.search = surface.search()
-        self.moving = Moving.of(surface, self.moving.motion, self.moving.on)
+        cloud, found = surface.cloud, None
+        if self.search is not None:
+            # Where there is no room; any other error will be raised again.
+            with contextlib.suppress(ValueError):
+                found = surface.moved(cloud.points, cloud.normals, search=self.search)
+        if found is None:
+            found = discretize(cloud, method=surface.method)
+            self.search = found.search()
+        self.moving = Moving.of(found, self.moving.motion, self.moving.on)
 
     def adapt_points(self, surface: Discretization | None = None) -> bool:
         """Points added and merged, if need be."""

@@ -50,7 +50,7 @@ EXPERIMENTS = {
     "E9": ("e09_rotation", "A quarter of a sphere turns once, three moves (paper 002, Fig. 5)"),
     "E12": (
         "e12_added_points",
-        "Points added on sphere and torus, three placings (paper 002, Section 3.7.2)",
+        "Points added on sphere and torus, three placings (paper 002, Section 3.7.4)",
     ),
     "E13": (
         "e13_expanding_sphere",

@@ -1,8 +1,8 @@
-r"""Points added on a sphere and a torus (3, 1), three placings (paper 002, Section 3.7.2).
+r"""Points added on a sphere and a torus (3, 1), three placings (paper 002, Section 3.7.4).
 
-The spacing is halved once. The largest distance from the surface of what goes into the holes:
-middles of circles in the plane of their corners, the same moved along their mean normal (after
-eqs. 8 and 9), and on the local polynomial surface of degree 4.
+The spacing is halved. The largest distance from the surface of what goes first into the holes (the
+paper's is the mean, after all rounds): middles of circles in the plane of their corners, the same
+moved along their mean normal (after eqs. 8 and 9), and on the local polynomial surface of degree 4.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def distances(surface: str, n: int) -> list[float]:
 
 def run(quick: bool, out: Path) -> list[Row]:
     rows: list[Row] = []
-    source = "paper 002, Section 3.7.2: half, and faster than h²"
+    source = "paper 002, Section 3.7.4: half, and faster than h²"
     for surface, sizes in _SIZES.items():
         numbers = sizes[:2] if quick else sizes
         numbers = tuple(n // 4 for n in numbers) if quick and surface == "torus" else numbers

@@ -55,8 +55,8 @@ class Adaptation(eqx.Module):
         TypeError: a spacing that is no number or function; other arguments that are no numbers.
         ValueError: a spacing, hole, closest distance, time or capacity that is not positive; holes
             so small that points in them would be too close.
-    Source: Suchde and Kuhnert 2019, Section 3.3.2 (there 0.45 and 0.2 of a smoothing length, which
-        is two spacings here); new points are on local polynomials instead of eqs. 8 and 9.
+    Source: Suchde and Kuhnert 2019, Sections 3.4 and 3.5 (there 0.45 and 0.2 of a smoothing length,
+        which is two spacings here); new points are on local polynomials instead of eqs. 8 and 9.
 
     Example:
         >>> adaptation = js.Adaptation(spacing=0.15)
@@ -184,7 +184,7 @@ def adapt_points(
 
 
 def checked_adaptation(adaptation: Any, surface: Discretization) -> None:
-    """Refuse what is none, and surfaces that it cannot serve."""
+    """Refuse what is none, and surfaces that are traced."""
     instance(adaptation, Adaptation, "adapt", "js.Adaptation(spacing=...)")
     needs_values("the surface whose points are adapted", surface)
 

@@ -30,7 +30,7 @@ def large_triangles(
     list tells; of those that reach farther the centre is moved towards the corner, so that the part
     that is known to be empty is what is returned.
 
-    Source: after paper 002, Section 3.3.2.
+    Source: after paper 002, Section 3.4.
     """
     x, frames = np.asarray(cloud.points, float), frames_of(np.asarray(cloud.normals, float))
     indices, mask = np.asarray(neighbors.indices), np.asarray(neighbors.mask)

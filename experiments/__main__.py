@@ -48,6 +48,7 @@ EXPERIMENTS = {
         "Diffusion over a bump against fine surface finite elements (paper 001, Figs. 5, 6)",
     ),
     "E9": ("e09_rotation", "A quarter of a sphere turns once, three moves (paper 002, Fig. 5)"),
+    "E11": ("e11_contact", "Two spheres meet, kept apart or made one (paper 002, Figs. 9, 10)"),
     "E12": (
         "e12_added_points",
         "Points added on sphere and torus, three placings (paper 002, Section 3.7.4)",
@@ -59,6 +60,10 @@ EXPERIMENTS = {
     "E14": (
         "e14_steps",
         "Heat with a source on the expanding sphere, errors of time (paper 002, Table 3)",
+    ),
+    "E16": (
+        "e16_dumbbell",
+        "A dumbbell by mean curvature flow pinches off (paper 002, Fig. 14)",
     ),
     "E18": (
         "e18_expanding_wave",

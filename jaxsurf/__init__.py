@@ -52,6 +52,7 @@ from .io import write as write
 from .moving.adaptation import Adaptation as Adaptation
 from .moving.adaptation import Adapted as Adapted
 from .moving.adaptation import adapt_points as adapt_points
+from .moving.contact import Contact as Contact
 from .moving.evolve import Evolution as Evolution
 from .moving.evolve import evolve as evolve
 from .moving.motions import AbstractMotion as AbstractMotion

@@ -571,6 +571,7 @@ BESIDE = {
     "AbstractPreconditioner": "jacobi", "AbstractEvolution": "integrate",
     "Motion": "evolve", "AbstractMotion": "evolve", "MeanCurvatureFlow": "evolve",
     "Evolution": "evolve", "Adaptation": "adapt_points", "Adapted": "adapt_points",
+    "Contact": "evolve",
     "moments": "volume", "compliance": "volume", "chamfer_distance": "volume",
 }  # fmt: skip
 

@@ -2,7 +2,6 @@ r"""Points added in holes and merged where they crowd, with fields on them."""
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,19 +13,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from ..arguments import as_float, finite, instance, real, switched_off, whole
-from ..borders.border import Border
-from ..borders.order import find_border
-from ..cloud import PointCloud
 from ..discretization import Discretization, discretize
 from ..failures import needs_values, raise_at
 from ..interpolation import interpolated, nearest_points
-from ..neighbors import Neighbors, find_neighbors
 from .holes import border_gaps, close_pairs, fillings
+from .rows import Rows, compact, exchanged
 
 # Each round fills the largest holes that do not touch, so the number of points may triple in it.
 _ROUNDS = 30
-# By how much the arrays grow when they are full, at least: all that has been compiled is lost.
-_GROWTH = 1.5
 # New points are interpolated in arrays of such sizes, times powers of two.
 _ROOM = 64
 
@@ -196,79 +190,61 @@ def changed(
     spacing: Float[np.ndarray, " n"],
 ) -> tuple[Discretization, PyTree[Array], int, int]:
     """A surface with lists of the usual size and its fields, in longer arrays if need be."""
-    cloud, neighbors, border = surface.cloud, surface.neighbors, surface.border
-    method, rank = surface.method, _ranks(surface)
-    degree, k = method.polynomial_degree, method.neighbor_count(cloud.dim)
-    added = merged = 0
+    rows, added, merged = Rows.of(surface, fields, spacing), 0, 0
     for _ in range(_ROUNDS):
-        x = np.asarray(cloud.points)
-        pairs = close_pairs(cloud, neighbors, adaptation.closest * spacing, rank)
-        holes = fillings(cloud, neighbors, adaptation.hole * spacing)
-        feet, normals_there = _on_border(cloud, border, adaptation.hole * spacing)
-        new = np.concatenate([feet, holes])
-        if not len(pairs) + len(new):
-            return Discretization(cloud, neighbors, method, border), fields, added, merged
-        added, merged = added + len(new), merged + len(pairs)
-        # What is on a border stays where it is.
-        stays = rank[pairs[:, :1]] > 0
-        kept = np.where(stays, x[pairs[:, 0]], np.mean(x[pairs], axis=1))
-        at, edge = np.concatenate([kept, new]), slice(len(pairs), len(pairs) + len(feet))
-        arrays = (cloud.points, cloud.normals, fields)
-        points, normals, values = _interpolated(cloud, neighbors, degree, at, arrays)
-        values = (points.at[edge].set(feet), normals.at[edge].set(normals_there), values)
-        wanted = spacing[np.asarray(nearest_points(cloud.points, cloud.active, jnp.asarray(at)))]
-        on = np.array(cloud.host_active)
-        on[pairs[:, 1]] = False
-        on = np.append(on, np.zeros(_more_rows(on, len(new), adaptation.capacity), bool))
-        rows = np.append(pairs[:, 0], np.flatnonzero(~on)[: len(new)])
-        more = len(on) - len(spacing)
-        on[rows], spacing, rank = True, np.pad(spacing, (0, more)), np.pad(rank, (0, more))
-        spacing[rows], rank[rows[len(pairs) :]] = wanted, 0
-        rank[rows[edge]] = 1
-        put = functools.partial(_put, rows, len(on))
-        points, normals, fields = jax.tree.map(put, arrays, values)
-        marked = None if border is None else jnp.asarray((rank > 0) & on)
-        cloud = PointCloud(points, normals, active=jnp.asarray(on), boundary=marked)
-        neighbors = _widened(find_neighbors(cloud, k), surface.neighbors.k)
-        border = None if border is None else find_border(cloud)
+        found = _sought(surface, rows, adaptation)
+        pairs, new = found.pairs, len(found.feet) + len(found.holes)
+        if not len(pairs) + new:
+            return surface, rows.fields, added, merged
+        added, merged = added + new, merged + len(pairs)
+        coming = _placed(surface, rows, found)
+        surface, rows = exchanged(surface, rows, pairs.ravel(), coming, adaptation.capacity)
     raise ValueError(
-        f"{len(new)} holes and {len(pairs)} crowded pairs of points are left after {_ROUNDS} "
+        f"{new} holes and {len(pairs)} crowded pairs of points are left after {_ROUNDS} "
         "rounds: the spacing wanted may change too much between neighbours"
     )
 
 
-def _ranks(surface: Discretization) -> Int[np.ndarray, " n"]:
-    """0 of points inside, 1 on the border, 2 at corners: which of two stays."""
-    rank, border = np.zeros(surface.n, int), surface.border
-    if border is not None:
-        points = np.asarray(border.points)
-        corners = border.corners if surface.cloud.dim == 3 else np.ones(len(points), bool)
-        rank[points] = 1 + corners
-    return rank
+class _Sought(NamedTuple):
+    """Where points are to change.
+
+    Args:
+        pairs: that crowd, the one that stays first.
+        feet, normals: places in the gaps of a border.
+        holes: places near holes inside.
+    """
+
+    pairs: Int[np.ndarray, "m 2"]
+    feet: Float[np.ndarray, "b d"]
+    normals: Float[np.ndarray, "b d"]
+    holes: Float[np.ndarray, "h d"]
 
 
-def _on_border(cloud: PointCloud, border: Border | None, radius):
-    """Points for the gaps of a border, and their normals."""
-    if border is None or cloud.dim == 2:
-        return np.zeros((0, cloud.dim)), np.zeros((0, cloud.dim))
-    return border_gaps(cloud, border, radius)
+def _sought(surface: Discretization, rows: Rows, adaptation: Adaptation) -> _Sought:
+    cloud, lists, border = surface.cloud, surface.neighbors, surface.border
+    spacing, rank = np.asarray(rows.spacing), np.asarray(rows.rank)
+    feet = normals = np.zeros((0, cloud.dim))
+    if border is not None and cloud.dim == 3:
+        feet, normals = map(np.asarray, border_gaps(cloud, border, adaptation.hole * spacing))
+    pairs = close_pairs(cloud, lists, adaptation.closest * spacing, rank)
+    return _Sought(pairs, feet, normals, fillings(cloud, lists, adaptation.hole * spacing))
 
 
-def compact(surface: Discretization, fields: PyTree[Array]) -> tuple[Discretization, PyTree[Array]]:
-    """Without the rows that are switched off."""
-    cloud, lists = surface.cloud, surface.neighbors
-    on = np.flatnonzero(cloud.host_active)
-    row = np.zeros(cloud.n, np.int32)
-    row[on] = np.arange(len(on))
-    marked = None if cloud.boundary is None else cloud.boundary[on]
-    border = surface.border
-    if border is not None:
-        renamed = lambda names: jnp.asarray(row[np.asarray(names)])
-        border = Border(renamed(border.points), renamed(border.rows), border.mask)
-    cloud = PointCloud(cloud.points[on], cloud.normals[on], boundary=marked)
-    lists = Neighbors(jnp.asarray(row[np.asarray(lists.indices)[on]]), lists.mask[on])
-    fields = jax.tree.map(lambda u: u[on], fields)
-    return Discretization(cloud, lists, surface.method, border), fields
+def _placed(surface: Discretization, rows: Rows, found: _Sought) -> Rows:
+    """One point for each pair, and one for each gap and hole."""
+    cloud, x, rank = surface.cloud, np.asarray(rows.points), np.asarray(rows.rank)
+    pairs, edge = found.pairs, slice(len(found.pairs), len(found.pairs) + len(found.feet))
+    # What is on a border stays where it is.
+    stays = rank[pairs[:, :1]] > 0
+    kept = np.where(stays, x[pairs[:, 0]], np.mean(x[pairs], axis=1))
+    at = np.concatenate([kept, found.feet, found.holes])
+    degree, arrays = surface.method.polynomial_degree, (cloud.points, cloud.normals, rows.fields)
+    points, normals, fields = _interpolated(cloud, surface.neighbors, degree, at, arrays)
+    points, normals = points.at[edge].set(found.feet), normals.at[edge].set(found.normals)
+    spacing = rows.spacing[nearest_points(cloud.points, cloud.active, jnp.asarray(at))]
+    ranks = np.zeros(len(at), rank.dtype)
+    ranks[: len(pairs)], ranks[edge] = rank[pairs[:, 0]], 1
+    return Rows(points, normals, fields, spacing, jnp.asarray(ranks))
 
 
 def conserved(before: Discretization, old, after: Discretization, new) -> PyTree[Array]:
@@ -294,28 +270,3 @@ def _interpolated(cloud, neighbors, degree: int, at, arrays) -> PyTree[Array]:
     parts = [v.reshape(count, *u.shape[1:]).astype(u.dtype) for u, v in zip(leaves, parts)]
     points, normals, fields = jax.tree.unflatten(structure, parts)
     return points, normals / jnp.linalg.norm(normals, axis=1, keepdims=True), fields
-
-
-def _more_rows(on: np.ndarray, added: int, capacity: int | None) -> int:
-    """By how much arrays are to grow."""
-    needed, rows = int(on.sum()) + added, len(on)
-    if capacity is not None and needed > capacity:
-        raise ValueError(f"the spacing wanted needs {needed} points, the capacity is {capacity}")
-    if capacity is not None:
-        return max(0, capacity - rows)
-    return 0 if needed <= rows else max(needed, math.ceil(_GROWTH * rows)) - rows
-
-
-def _widened(lists: Neighbors, k: int) -> Neighbors:
-    """With as many slots."""
-    more = ((0, 0), (0, max(0, k - lists.k)))
-    indices = np.where(
-        np.pad(lists.mask, more), np.pad(lists.indices, more), np.arange(lists.n)[:, None]
-    )
-    return Neighbors(jnp.asarray(indices.astype(np.int32)), jnp.asarray(np.pad(lists.mask, more)))
-
-
-def _put(rows: np.ndarray, count: int, old: Array, new: Array) -> Array:
-    """Some rows replaced, in an array that gets more rows like its first."""
-    longer = jnp.broadcast_to(old[:1], (count - len(old), *old.shape[1:]))
-    return jnp.concatenate([old, longer]).at[rows].set(new)

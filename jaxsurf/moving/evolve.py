@@ -24,10 +24,14 @@ from ..time.asked import check_coefficients
 from ..time.checkpoint import Checkpoint
 from ..time.integrate import integrate
 from ..time.problem import AbstractEvolution, checked_problem
-from .adaptation import Adaptation, checked_adaptation, compact
+from .adaptation import Adaptation, checked_adaptation
+from .contact import Contact, checked_contact
 from .follow import followed
 from .motions import AbstractMotion, checked_motion
 from .problem import Moving, joined, parted
+from .rows import compact
+
+_EVENTS = ("t", "added", "merged", "pinched", "joined", "vanished")
 
 
 class Evolution(eqx.Module):
@@ -38,7 +42,7 @@ class Evolution(eqx.Module):
         rows: surface and fields at each; after adaptation with rows that are switched off.
         stats: how many steps were taken and refused, how often neighbours were found anew; the
             solver and why.
-        changes: of the points, by adaptation: times, numbers of points added and of pairs merged.
+        changes: of the points, by adaptation and contact: see `history`.
 
     Example:
         >>> motion = js.Motion(lambda t, surface, fields, args: surface.cloud.normals)
@@ -50,7 +54,7 @@ class Evolution(eqx.Module):
     ts: Float[Array, " m"]
     rows: list[tuple[Discretization, PyTree[Array]]]
     stats: dict[str, Any]
-    changes: Float[np.ndarray, "e 3"] | None = None
+    changes: Float[np.ndarray, "e 6"] | None = None
 
     @Kept
     def _seen(self) -> list[tuple[Discretization, PyTree[Array]]]:
@@ -76,12 +80,13 @@ class Evolution(eqx.Module):
         r"""Number of points, area, enclosed volume and integrals of the fields at each time.
 
         The volume is $\\tfrac1d\\int x\\cdot n$, of closed surfaces. With adaptation also "events":
-        when how many points were "added" and how many pairs "merged". Raises what `areas` does.
+        when how many points were "added" and pairs "merged", and how many necks were "pinched",
+        gaps "joined" and parts "vanished" by contact. Raises what `areas` does.
         """
         rows = [_measured(*row) for row in self.rows]
         history = {"t": self.ts} | jax.tree.map(lambda *values: jnp.stack(values), *rows)
         if self.changes is not None:
-            history["events"] = dict(zip(("t", "added", "merged"), self.changes.T))
+            history["events"] = dict(zip(_EVENTS, self.changes.T))
         return history
 
     def __repr__(self):
@@ -111,6 +116,7 @@ def evolve(
     atol: float = 1e-7,
     args: Any = None,
     adapt: Adaptation | None = None,
+    contact: Contact | None = None,
     checkpoint: Checkpoint | None = None,
     progress: bool = False,
 ) -> Evolution:
@@ -139,6 +145,8 @@ def evolve(
         adapt: add points in holes and merge those that crowd, at the start and on the way. What
             the problem, the velocity or a spacing takes must then not have one row per point, but
             be computed from the surface; the support of operators follows from the neighbours.
+        contact: what happens where sheets come near each other; if None, they cross. Where nothing
+            is left of a surface, the run ends: times after that are not in `ts`.
         checkpoint: write all to disk now and then, and go on from there if it is; a run that was
             killed ends in the same bits as one that was not. After an error the last good state is
             on disk.
@@ -178,9 +186,11 @@ def evolve(
     field = lambda u: finite(switched_off(on, as_float(u, "fields", (n, ...))), "fields")
     fields = jax.tree.map(field, fields)
     concrete = is_concrete(surface, fields, args, t0, t1)
-    for name, value in (("adapt", adapt), ("checkpoint", checkpoint)):
+    for name, value in (("adapt", adapt), ("contact", contact), ("checkpoint", checkpoint)):
         if value is not None and not concrete:
             raise ValueError(f"{name} needs concrete arrays: it is the host that looks at them")
+    if contact is not None and checked_contact(contact).deletes and adapt is None:
+        raise ValueError("contact of kind 'delete' needs adapt: new parts are filled with points")
     if adapt is not None:
         surface, fields = _with_rows(surface, fields, adapt)
     times = _times(t0, t1, saveat)
@@ -196,7 +206,9 @@ def evolve(
     if checkpoint is not None:
         instance(checkpoint, Checkpoint, "checkpoint", "js.Checkpoint(path, every=...)")
     if concrete:
-        return Evolution(*followed(moving, state, t0, times, options, adapt, checkpoint, progress))
+        return Evolution(
+            *followed(moving, state, t0, times, options, adapt, contact, checkpoint, progress)
+        )
     return _kept(moving, state, t0, times, options)
 
 

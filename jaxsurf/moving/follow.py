@@ -24,12 +24,17 @@ from ..time.checkpoint import Checkpoint, digest, read_back, written
 from ..time.integrate import integrate
 from ..time.run import planned
 from .adaptation import Adaptation, changed, conserved
+from .contact import Contact, watched
 from .problem import Moving, joined, parted
+from .surgery import rejoined
 
 # Points are added and merged where neighbourhoods have grown or shrunk by this factor.
 _STRETCH = 1.15
 # Lists are found anew once points outside may come as near as this share of the farthest in them.
 _WORN = 0.75
+# Sheets that approach are looked at before a step has taken them nearer by this share of the
+# distance at which they touch.
+_PAST = 0.05
 # Of the way that is left; a surface that cannot be followed this far is an error.
 _LEAST = 1e-6
 
@@ -54,7 +59,7 @@ class _Progress(NamedTuple):
         place: at the end of the last.
         saved: at the times asked for; those not reached hold anything.
         counts: steps accepted and refused, and how often neighbours were found anew.
-        changes: of the points: times, numbers of points added and of pairs merged.
+        changes: of the points: times, and what `Evolution.history` tells of them.
     """
 
     part: Any
@@ -71,6 +76,7 @@ def followed(
     times,
     options,
     adapt: Adaptation | None,
+    contact: Contact | None,
     checkpoint: Checkpoint | None,
     progress: bool,
 ) -> tuple:
@@ -79,14 +85,15 @@ def followed(
     ends, file = times[-1:], None
     if checkpoint is not None:
         ends = _ends(start, times[-1], checkpoint.every)
-        file = _File(checkpoint, _digest(moving, state, start, times, options, adapt, checkpoint))
-    run = _Run(moving, state, start, options, adapt)
+        kinds = (adapt, contact)
+        file = _File(checkpoint, _digest(moving, state, start, times, options, kinds, checkpoint))
+    run = _Run(moving, state, start, options, adapt, contact)
     saved: list = [run.saved] * len(times)
     now = _Progress(np.array(0), run.place, saved, run.counts, run.changes)
     if file is not None:
         now, run.solver = file.read(now, adapt is None)
     if adapt is not None and not now.part:
-        run.adapt_points()
+        run.change(run.moving.surface)
         now = now._replace(place=run.place, changes=run.changes)
     saved = list(now.saved)
     with tqdm(total=float(times[-1] - start), disable=not progress, unit="t") as bar:
@@ -99,15 +106,19 @@ def followed(
                 before = run.t
                 run.to(end if i is None else times[i])
                 bar.update(float(run.t - before))
-                if i is not None:
+                if i is not None and not run.gone:
                     saved[i] = run.saved
             now = _Progress(np.array(part + 1), run.place, saved, run.counts, run.changes)
+            if run.gone:
+                break
             if file is not None:
                 file.write(now)
     steps, refused, renewals = map(int, now.counts)
     stats = {"steps": steps, "refused": refused, "renewals": renewals, "solver": run.solver}
-    rows = [(place.surface, parted(place.state)[1]) for place in saved]
-    return jnp.asarray(times), rows, stats, None if adapt is None else np.asarray(now.changes)
+    count = np.sum(times < run.t) if run.gone else len(times)
+    rows = [(place.surface, parted(place.state)[1]) for place in saved[:count]]
+    changes = None if adapt is None else np.asarray(now.changes)
+    return jnp.asarray(times[:count]), rows, stats, changes
 
 
 class _File(NamedTuple):
@@ -135,27 +146,40 @@ def _ends(start, end, every: float) -> np.ndarray:
     return np.append(start + every * np.arange(1, count), end).astype(end.dtype)
 
 
-def _digest(moving: Moving, state, start, times, options, adapt, checkpoint: Checkpoint) -> str:
+def _digest(moving: Moving, state, start, times, options, kinds, checkpoint: Checkpoint) -> str:
     """Of all that a run hangs on; functions by what they compute."""
     unset = dict.fromkeys(("controller", "saveat", "event", "adjoint", "max_steps"))
     plan = planned(moving, state, start, times[-1], **options, **unset, progress=False, throw=True)
-    return digest((checkpoint.every, times, moving.surface.neighbors, adapt, plan.run))
+    return digest((checkpoint.every, times, moving.surface.neighbors, kinds, plan.run))
 
 
 class _Run:
     """A run under way: points, fields and lists now, and what it took to come here."""
 
-    def __init__(self, moving: Moving, state, t, options, adapt: Adaptation | None):
+    def __init__(self, moving: Moving, state, t, options, adapt, contact):
         self.moving, self.state, self.t = moving, state, t
-        self.options, self.adapt, self.solver = options, adapt, ""
+        self.options, self.solver, self.gone = options, "", False
+        self.adapt: Adaptation | None = adapt
+        self.contact: Contact | None = contact
         self.search: NeighborSearch | None = None
-        self.counts, self.changes = np.zeros(3, int), np.zeros((0, 3))
+        self.counts, self.changes = np.zeros(3, int), np.zeros((0, 6))
+        self.watch()
 
     def goes_on(self, t, now: _Progress) -> None:
         """From what is on disk, or would be."""
         self.moving = Moving.of(now.place.surface, self.moving.motion, self.moving.on)
         self.t, self.state, self.search = t, now.place.state, None
         self.counts, self.changes = np.asarray(now.counts), np.asarray(now.changes)
+        self.watch()
+
+    def watch(self) -> None:
+        """Sheets that are near each other, from where lists were found."""
+        surface, self.free = self.moving.surface, None
+        if self.contact is not None:
+            free, faced = watched(self.contact, surface.cloud, surface.neighbors)
+            free = np.where(surface.cloud.host_active, free, np.inf)
+            self.free = jnp.asarray(free, surface.cloud.points.dtype)
+            self.moving = Moving.of(surface, self.moving.motion, self.moving.on, faced)
 
     @property
     def place(self) -> _Place:
@@ -178,10 +202,11 @@ class _Run:
         """To a later time, with neighbours found anew and points adapted on the way."""
         every = np.inf if self.adapt is None or self.adapt.every is None else self.adapt.every
         end = target
-        while float(self.t) < float(target):
+        while float(self.t) < float(target) and not self.gone:
             end = min(end, self.t + every)
             surface, neighbors = self.moving.surface, self.moving.surface.neighbors
-            event = dfx.Event(_Worn(surface.cloud.points, neighbors, self.adapt is not None))
+            start, uneven = surface.cloud.points, self.adapt is not None
+            event = dfx.Event(_Worn(start, neighbors, self.free, uneven))
             solution = integrate(
                 self.moving, self.state, t0=self.t, t1=end, event=event, **self.options
             )
@@ -192,7 +217,7 @@ class _Run:
             )
             self.solver = solution.stats["solver"]
             left = reached - self.t > _LEAST * (target - self.t)
-            if left and jnp.any(unreached(surface.cloud.points, new[0], neighbors)):
+            if left and (jnp.any(unreached(start, new[0], neighbors)) or self.may_cross(new[0])):
                 # The last step went farther than the neighbours serve: half of the way first.
                 end = self.t + (reached - self.t) / 2
                 self.count(0, steps + refused, 0)
@@ -202,8 +227,16 @@ class _Run:
             if solution.result == dfx.RESULTS.event_occurred or float(reached) < float(target):
                 self.renew()
 
+    def may_cross(self, points) -> bool:
+        """Whether sheets were so near each other that they may have crossed."""
+        if self.contact is None or self.free is None:
+            return False
+        limit = self.free + _PAST * self.contact.distance
+        away = jnp.sum((points - self.moving.surface.cloud.points) ** 2, axis=1)
+        return bool(jnp.any(away > limit**2))
+
     def renew(self) -> None:
-        """Normals and neighbours found anew, and points adapted."""
+        """Normals and neighbours found anew, and points changed."""
         surface, cloud = self.moving.surface, self.moving.cloud_at(self.state[0])
         degree = surface.method.polynomial_degree
         normals = refit_normals(cloud.points, cloud.normals, surface.neighbors, degree=degree)
@@ -212,7 +245,7 @@ class _Run:
             self.search = surface.search()
         surface = Discretization(cloud, surface.neighbors, surface.method, surface.border)
         self.count(0, 0, 1)
-        if self.adapt is None or not self.adapt_points(surface):
+        if self.adapt is None or not self.change(surface):
             self.begin(surface)
 
     def begin(self, surface: Discretization) -> None:
@@ -226,38 +259,58 @@ class _Run:
             found = discretize(cloud, method=surface.method)
             self.search = found.search()
         self.moving = Moving.of(found, self.moving.motion, self.moving.on)
+        self.watch()
 
-    def adapt_points(self, surface: Discretization | None = None) -> bool:
-        """Points added and merged, if need be."""
-        assert self.adapt is not None
-        surface = self.moving.surface if surface is None else surface
-        fields = parted(self.state)[1]
-        spacing = self.adapt.at(self.t, surface, fields, self.options["args"])
-        after, new, *count = changed(surface, fields, self.adapt, spacing)
-        if not any(count):
+    def change(self, surface: Discretization) -> bool:
+        """Sheets that touch rejoined, points added and merged, if need be."""
+        adapt, contact, args = self.adapt, self.contact, self.options["args"]
+        assert adapt is not None
+        old = fields = parted(self.state)[1]
+        spacing, after, met = adapt.at(self.t, surface, fields, args), surface, (0, 0, 0)
+        if contact is not None and contact.deletes:
+            distance = float(contact.distance)
+            left, fields, found = rejoined(surface, fields, distance, spacing, adapt.capacity)
+            if found is not None:
+                met = (found.pinched, found.joined, found.vanished)
+            if left is None:
+                self.gone = True
+                return self.changed(0, 0, *met)
+            if found is not None:
+                after, spacing = left, adapt.at(self.t, left, fields, args)
+        after, fields, added, merged = changed(after, fields, adapt, spacing)
+        if not self.changed(added, merged, *met):
             return False
         self.begin(after)
-        if self.adapt.conserve:
-            new = conserved(surface, fields, self.moving.surface, new)
-        self.state = joined(after.cloud.points, new)
-        self.changes = np.append(self.changes, [[float(self.t), *count]], axis=0)
+        if adapt.conserve:
+            fields = conserved(surface, old, self.moving.surface, fields)
+        self.state = joined(after.cloud.points, fields)
         return True
+
+    def changed(self, *count: int) -> bool:
+        """Noted, if anything was."""
+        if any(count):
+            self.changes = np.append(self.changes, [[float(self.t), *count]], axis=0)
+        return any(count)
 
 
 class _Worn(eqx.Module):
     """True once lists do not serve well, from where the points were when they were found.
 
     Args:
+        free: how far points may go before sheets may touch; None if that does not matter.
         uneven: also where neighbourhoods have become so much larger or smaller that points are to
             be added or merged.
     """
 
     points: Float[Array, "n d"]
     neighbors: Neighbors
+    free: Float[Array, " n"] | None
     uneven: bool = eqx.field(static=True)
 
     def __call__(self, t, y, args, **_) -> Bool[Array, ""]:
         worn = unreached(self.points, y[0], self.neighbors, _WORN)
+        if self.free is not None:
+            worn = worn | (jnp.sum((y[0] - self.points) ** 2, axis=1) > self.free**2)
         if self.uneven:
             growth = stretch(self.points, y[0], self.neighbors)
             worn = worn | (growth > _STRETCH) | (growth < 1 / _STRETCH)

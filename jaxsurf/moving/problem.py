@@ -19,6 +19,7 @@ from ..stencils.algebra import AbstractOperator
 from ..stencils.stencil import Stencil
 from ..time.explicit import RKC2
 from ..time.problem import AbstractEvolution
+from .contact import Faced
 from .motions import AbstractMotion
 
 
@@ -30,6 +31,7 @@ class Moving(AbstractEvolution):
         gradient: of the surface there, which tells normals from positions.
         motion: v.
         on: makes the problem of the fields from a surface; None: fields go with the points.
+        faced: what points are kept apart from.
         pull: the stiff part of v on the surface of a state, see `at`.
         problem: that of the fields there.
     """
@@ -39,12 +41,19 @@ class Moving(AbstractEvolution):
     gradient: Stencil
     motion: AbstractMotion
     on: Callable | None
+    faced: Faced | None = None
     pull: AbstractOperator | None = None
     problem: AbstractEvolution | None = None
 
     @classmethod
-    def of(cls, surface: Discretization, motion: AbstractMotion, on: Callable | None) -> Moving:
-        return cls(None, surface, surface.gradient, motion, on)
+    def of(
+        cls,
+        surface: Discretization,
+        motion: AbstractMotion,
+        on: Callable | None,
+        faced: Faced | None = None,
+    ) -> Moving:
+        return cls(None, surface, surface.gradient, motion, on, faced)
 
     def surface_at(self, points: Array) -> Discretization:
         """The surface with its points elsewhere."""
@@ -81,6 +90,8 @@ class Moving(AbstractEvolution):
         velocity = self.motion.velocity(t, surface, fields, args)
         name = f"velocity of {type(self.motion).__name__}"
         velocity = as_float(velocity, name, points.shape).astype(points.dtype)
+        if self.faced is not None:
+            velocity = self.faced.kept_apart(points, surface.cloud.normals, velocity)
         if self.on is None:
             return self._free(joined(velocity, jax.tree.map(jnp.zeros_like, fields)))
         problem = self.on(surface)

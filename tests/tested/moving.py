@@ -17,6 +17,12 @@ _FILLED = (
     f"{_A}test_spacing_may_follow_the_curvature_and_integrals_stay, "
     f"{_A}test_borders_stay_and_their_gaps_are_filled"
 )
+_C = "test_contact.py::"
+_MET = (
+    f"{_C}test_what_faces_what, {_C}test_a_cut_leaves_closed_surfaces, "
+    f"{_C}test_plane_curves_pinch_too, {_C}test_a_waist_that_is_squeezed_pinches_off, "
+    f"{_C}test_parts_vanish_and_a_run_ends_with_the_last, {_C}test_sheets_are_kept_apart"
+)
 _CHOSEN = "(which points there are is decided on the host)"
 
 _ADAPTED: dict[str, Entry] = {
@@ -31,6 +37,14 @@ _ADAPTED: dict[str, Entry] = {
 TESTED: dict[str, dict[str, Entry]] = {
     "Adaptation": _ADAPTED,
     "adapt_points": _ADAPTED,
+    "Contact": {
+        "value": _MET,
+        "gradient": _CHOSEN,
+        "jit": _CHOSEN,
+        "vmap": _CHOSEN,
+        "float32": _C + "test_in_single_precision",
+        "bad input": "malformed",
+    },
     "Adapted": {
         "value": _FILLED,
         "gradient": _CHOSEN,

@@ -1,0 +1,209 @@
+"""Sheets that meet: necks pinch off, drops become one, others are kept apart."""
+
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+import jaxsurf as js
+from jaxsurf.moving import follow
+from jaxsurf.moving.contact import chambers, facing
+from jaxsurf.moving.surgery import HermiteSurface, rejoined
+
+METHOD = js.GFDM(degree=2)
+RNG = np.random.default_rng(3)
+
+
+def spheres(n, centers, radii):
+    x = np.asarray(js.sphere(n).points)
+    turned = (x, x[:, [1, 0, 2]])
+    points = [c + r * y for c, r, y in zip(centers, radii, turned)]
+    return js.PointCloud(np.concatenate(points), np.concatenate(turned))
+
+
+def closed(surface):
+    """Number of parts, from their total curvature 4 pi each, and from their lists."""
+    parts = chambers(surface.cloud, surface.neighbors)
+    with warnings.catch_warnings(action="ignore"):  # new parts bend within few spacings
+        total = float(surface.integrate(surface.gauss_curvature)) / (4 * np.pi)
+    return total, parts.max() + 1
+
+
+def test_a_hermite_surface_meets_its_conditions_and_a_sphere():
+    x = np.asarray(js.sphere(60).points)
+    surface = HermiteSurface(x, x, np.zeros((1, 3)), np.array([-0.5]), 0.4)
+    value, slope = surface(x)
+    assert np.abs(value).max() < 1e-10 and np.abs(slope - x).max() < 1e-9
+    assert abs(surface(np.zeros((1, 3)))[0][0] + 0.5) < 1e-10
+    y = RNG.normal(size=(200, 3))
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    value, slope = surface(y)
+    assert np.abs(value).max() < 5e-3
+    ahead, h = RNG.normal(size=3), 1e-5
+    difference = (surface(y + h * ahead)[0] - surface(y - h * ahead)[0]) / (2 * h)
+    np.testing.assert_allclose(slope @ ahead, difference, atol=1e-7)
+
+
+def test_what_faces_what():
+    """Two spheres by their outsides, one that is small by its inside, as a search of all tells."""
+    cloud = spheres(300, ([-1.1, 0, 0], [0.2, 0, 0]), (1.0, 0.2))
+    found = facing(cloud, 0.45)
+    x, n = cloud.points, cloud.normals
+    way = x[:, None] - x
+    gap = np.linalg.norm(way, axis=2)
+    ups = np.einsum("ijd,jd->ij", way, n) / np.where(gap > 0, gap, 1)
+    good = (gap < 0.45) & (n @ n.T < -0.45) & (np.abs(ups) > 0.85) & (np.abs(ups.T) > 0.85)
+    good &= ups * ups.T > 0
+    wanted = np.argwhere(np.triu(good))
+    assert {tuple(p) for p in found.pairs.tolist()} == {tuple(p) for p in wanted.tolist()}
+    both_small = np.all(found.pairs >= 300, axis=1)
+    np.testing.assert_array_equal(found.inside, both_small)
+    assert both_small.any() and not both_small.all()
+    np.testing.assert_allclose(found.gap, gap[*found.pairs.T])
+
+
+def with_a_waist(width, spacing=0.07):
+    phi = lambda x: x[0] ** 2 + x[1] ** 2 - (1 - x[2] ** 2) * (width**2 + x[2] ** 2)
+    return js.level_set(phi, spacing=spacing, bounds=((-0.7, -0.7, -1.1), (0.7, 0.7, 1.1)))
+
+
+@pytest.mark.parametrize("kind", ["pinched", "joined"])
+def test_a_cut_leaves_closed_surfaces(kind):
+    pinched = kind == "pinched"
+    if pinched:
+        cloud, distance = with_a_waist(0.12), 0.25
+    else:
+        cloud, distance = spheres(800, ([-0.55, 0, 0], [0.55, 0, 0]), (0.5, 0.5)), 0.2
+    surface, h, u = js.discretize(cloud, method=METHOD), 0.07, cloud.points[:, 2]
+    assert closed(surface)[1] == 2 - pinched
+    cut, (v,), found = rejoined(surface, (u,), distance, np.full(cloud.n, h), None)
+    assert (found.pinched, found.joined, found.vanished) == (pinched, not pinched, 0)
+    smooth = js.adapt_points(cut, js.Adaptation(h)).surface
+    total, parts = closed(smooth)
+    assert parts == 1 + pinched and abs(total - parts) < 0.15
+    assert not len(facing(smooth.cloud, distance).pairs)
+    # Other points are as they were, new ones carry what is around them.
+    on = np.flatnonzero(cut.cloud.host_active)
+    x, v = np.asarray(cut.cloud.points)[on], np.asarray(v)[on]
+    away = cKDTree(cloud.points).query(x)[0]
+    assert np.all(away[np.linalg.norm(x, axis=1) > 0.5] == 0) and away.max() > h / 2
+    assert np.all(v[away == 0] == x[away == 0, 2]) and np.abs(v - x[:, 2]).max() < 0.12
+
+
+def test_plane_curves_pinch_too():
+    angle = 2 * np.pi * np.arange(160) / 160
+    width = 0.1 + 0.9 * np.abs(np.cos(angle)) ** 2
+    x = np.stack([np.cos(angle), width * np.sin(angle)], axis=1)
+    tangent = np.roll(x, -1, axis=0) - np.roll(x, 1, axis=0)
+    normals = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
+    cloud = js.PointCloud(x, normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    cloud = js.PointCloud(
+        cloud.points,
+        js.refit_normals(cloud.points, cloud.normals, js.find_neighbors(cloud, k=9), degree=4),
+    )
+    surface = js.discretize(cloud, method=METHOD)
+    cut, _, found = rejoined(surface, (), 0.25, np.full(160, 0.04), None)
+    assert (found.pinched, found.joined) == (1, 0)
+    smooth = js.adapt_points(cut, js.Adaptation(0.04)).surface
+    assert chambers(smooth.cloud, smooth.neighbors).max() == 1
+    turning = smooth.integrate(smooth.mean_curvature)
+    assert abs(float(turning) / (2 * np.pi) - 2) < 0.1
+
+
+def shrinking(t, surface, fields, args):
+    return -surface.cloud.normals
+
+
+@pytest.mark.slow
+def test_parts_vanish_and_a_run_ends_with_the_last():
+    cloud = spheres(250, ([-1, 0, 0], [1, 0, 0]), (0.3, 0.4))
+    given = dict(adapt=js.Adaptation(0.08, capacity=550), contact=js.Contact(0.32), method=METHOD)
+    run = js.evolve(js.Motion(shrinking), cloud, t1=0.4, saveat=[0.1, 0.2, 0.35], **given)
+    # They are as thick as the distance at 0.14 and 0.24.
+    np.testing.assert_array_equal(run.ts, [0.1, 0.2])
+    assert np.asarray(run.clouds[0].points)[:, 0].min() < -1
+    assert np.asarray(run.clouds[1].points)[:, 0].min() > 0.8
+    events = run.history["events"]
+    gone = events["t"][events["vanished"] > 0]
+    np.testing.assert_array_equal(events["vanished"][events["vanished"] > 0], 1)
+    np.testing.assert_allclose(gone, [0.14, 0.24], atol=0.016)
+    assert not events["pinched"].any() and not events["joined"].any()
+
+
+@pytest.mark.slow
+def test_a_waist_that_is_squeezed_pinches_off(tmp_path, monkeypatch):
+    """And a run that was killed ends in the same bits."""
+    start = with_a_waist(0.28, 0.1)
+
+    def squeezed(t, surface, fields, args):
+        x = surface.cloud.points
+        return -x * jnp.array([1.0, 1, 0]) * jnp.exp(-((x[:, 2:] / 0.3) ** 2))
+
+    def run(name):
+        given = dict(fields=jnp.ones(start.n), adapt=js.Adaptation(0.1, capacity=start.n + 100))
+        given |= dict(checkpoint=js.Checkpoint(tmp_path / name, every=0.6), method=METHOD)
+        return js.evolve(js.Motion(squeezed), start, t1=0.8, contact=js.Contact(0.4), **given)
+
+    whole = run("whole")
+    events, end = whole.history["events"], whole.surfaces[-1]
+    assert events["pinched"].sum() == 1 and events["joined"].sum() == 0
+    # Its radius falls as exp(-t); between 1 and 0.85 of its width is looked at, and sheets may
+    # come nearer by a fifth of the distance between two looks.
+    pinched = float(events["t"][events["pinched"] > 0][0])
+    assert np.log(0.85 * 0.28 / 0.2) < pinched < np.log(0.28 / (0.8 * 0.2))
+    assert chambers(end.cloud, end.neighbors).max() == 1
+    assert np.abs(whole.fields[-1] - 1).max() < 1e-12
+    assert np.abs(end.cloud.points[:, 2]).min() > 0.1
+
+    class Killed(Exception):
+        pass
+
+    def write_and_die(*content):
+        written(*content)
+        raise Killed
+
+    written = follow.written
+    monkeypatch.setattr(follow, "written", write_and_die)
+    with pytest.raises(Killed):
+        run("killed")
+    monkeypatch.undo()
+    again = run("killed")
+    np.testing.assert_array_equal(again.changes, whole.changes)
+    np.testing.assert_array_equal(again.clouds[-1].points, whole.clouds[-1].points)
+
+
+@pytest.mark.slow
+def test_sheets_are_kept_apart():
+    """Plates whose normals point the same way, some points off; spheres are in E11."""
+    d = 0.2
+    flat = np.stack(np.meshgrid(*(np.linspace(-0.5, 0.5, 10),) * 2), axis=2).reshape(-1, 2)
+    x = np.c_[np.concatenate([flat, flat + 0.02]), np.repeat([-0.3, 0.3], 100)]
+    off = np.arange(200) % 50 == 34
+    cloud = js.PointCloud(x, np.tile([[0.0, 0, 1]], (200, 1)), active=~off)
+    up = np.sign(x[:, 2:]) * np.array([0.0, 0, 1])
+    meet = js.Motion(lambda t, surface, fields, args: -jnp.asarray(up))
+    given = dict(method=METHOD, contact=js.Contact(d, kind="non-penetration"))
+    run = js.evolve(meet, cloud, t1=0.5, saveat=[0.08], **given)
+    # Without contact they would have met at 0.3. At first the other one is too far.
+    free, end = (np.asarray(one.points) for one in run.clouds)
+    np.testing.assert_allclose((free - x)[~off], -0.08 * up[~off], atol=1e-12)
+    low = up[:, 2] < 0
+    gap = cKDTree(end[low & ~off]).query(end[~low & ~off])[0]
+    assert 0.95 * d < gap.min() and np.median(gap) < 1.3 * d
+    np.testing.assert_array_equal(end[off], x[off])
+
+
+def test_in_single_precision():
+    """The same sheets face each other, and what closes the cut is within 1e-5."""
+    cloud, found, values = with_a_waist(0.12), [], []
+    middle, y = np.zeros((1, 3)), RNG.uniform(-0.2, 0.2, (100, 3))
+    near = np.abs(np.linalg.norm(cloud.points, axis=1) - 0.6) < 0.2
+    for dtype in (jnp.float64, jnp.float32):
+        x, n = cloud.points.astype(dtype), cloud.normals.astype(dtype)
+        found.append(facing(js.PointCloud(x, n), 0.25))
+        x, n = (np.asarray(a, float)[near] for a in (x, n))
+        values.append(HermiteSurface(x, n, middle, np.array([0.25]), 0.07)(y)[0])
+    np.testing.assert_array_equal(found[0].pairs, found[1].pairs)
+    assert len(found[0].pairs) and np.abs(values[0] - values[1]).max() < 1e-5

@@ -240,7 +240,8 @@ def _placed(surface: Discretization, rows: Rows, found: _Sought) -> Rows:
     at = np.concatenate([kept, found.feet, found.holes])
     degree, arrays = surface.method.polynomial_degree, (cloud.points, cloud.normals, rows.fields)
     points, normals, fields = _interpolated(cloud, surface.neighbors, degree, at, arrays)
-    points, normals = points.at[edge].set(found.feet), normals.at[edge].set(found.normals)
+    on_edge = (jnp.asarray(a, points.dtype) for a in (found.feet, found.normals))
+    points, normals = (a.at[edge].set(b) for a, b in zip((points, normals), on_edge))
     spacing = rows.spacing[nearest_points(cloud.points, cloud.active, jnp.asarray(at))]
     ranks = np.zeros(len(at), rank.dtype)
     ranks[: len(pairs)], ranks[edge] = rank[pairs[:, 0]], 1

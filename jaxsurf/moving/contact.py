@@ -34,18 +34,21 @@ class Contact(eqx.Module):
 
     Sheets are of two surfaces or of one, and meet from outside, or through the inside of a part
     that has become thin. Those are found by their normals, which oppose each other. Only sheets of
-    two surfaces that are kept apart may have normals that point the same way; they must then stay
-    two spacings apart, or their neighbourhoods mix.
+    two surfaces that are kept apart may have normals that point the same way.
 
     Args:
         distance: at which sheets touch, in length. For "delete" three to five spacings: a neck is
-            that thick when it pinches off, and must still carry stencils.
+            that thick when it pinches off, and must still carry stencils. For "non-penetration" two
+            or more.
         kind: "delete" cuts out what touches and closes what is left: a neck pinches off, two drops
             become one, what is thinner everywhere vanishes. The new parts are the zero set of a
             smooth function that passes through the points around with their normals. It needs
             `adapt`, and a closed surface there. "non-penetration" takes away the velocity with
             which sheets approach, half from each, more and more from twice the distance on.
 
+    Accuracy: looks follow each other so that sheets come nearer by at most a fifth of the distance
+        unseen; new parts pass through the points around (`tests/test_contact.py`); in float32
+        they are within 1e-5.
     Raises:
         TypeError: a distance that is no number.
         ValueError: a distance that is not positive, another kind.
@@ -54,13 +57,14 @@ class Contact(eqx.Module):
         sheets are looked at before they can have crossed.
 
     Example:
-        >>> x = js.sphere(400).points
-        >>> both = jnp.concatenate([x - jnp.array([1.4, 0, 0]), x + jnp.array([1.4, 0, 0])])
-        >>> cloud = js.PointCloud(both, jnp.concatenate([x, x]))
-        >>> meet = js.Motion(lambda t, surface, u, args: jnp.sign(-both) * jnp.array([1.0, 0, 0]))
-        >>> end = js.evolve(meet, cloud, t1=1.0, contact=js.Contact(0.1, kind="non-penetration"))
-        >>> bool((jnp.abs(end.clouds[-1].points[:, 0]) > 0.04).all())
-        True
+        >>> x, half = js.sphere(200).points, jnp.array([1.5, 0, 0])
+        >>> both = js.PointCloud(jnp.concatenate([x - half, x + half]), jnp.concatenate([x, x]))
+        >>> ahead = jnp.repeat(jnp.array([[1.0, 0, 0], [-1.0, 0, 0]]), 200, axis=0)
+        >>> meet = js.Motion(lambda t, surface, fields, args: ahead)
+        >>> end = js.evolve(meet, both, t1=0.2, contact=js.Contact(0.5, kind="non-penetration"))
+        >>> way = jnp.abs(end.clouds[-1].points - both.points)[:, 0]
+        >>> bool(way.min() < 0.17), bool(abs(way.max() - 0.2) < 1e-6)
+        (True, True)
     """
 
     distance: Float[Array, ""]

@@ -24,7 +24,9 @@ _METHODS: dict[Method, int] = {js.DCPSE(order=r): r for r in (2, 3, 4)} | {
 
 def run(quick: bool, out: Path) -> list[Row]:
     sizes = [2_000, 4_000] if quick else [2_000, 4_000, 8_000, 16_000, 32_000]
-    methods: list[Method] = [js.DCPSE(order=4), js.GFDM(degree=4)] if quick else [*_METHODS]
+    methods: list[Method] = (
+        [js.DCPSE(order=2), js.DCPSE(order=4), js.GFDM(degree=4)] if quick else [*_METHODS]
+    )
     shapes = [surfaces.sphere(), surfaces.ellipsoid(), surfaces.torus()]
     rows: list[Row] = []
     kinds = {s.name: (_QUICK[s.name],) if quick else _KINDS for s in shapes}

@@ -47,7 +47,7 @@ def run(quick: bool, out: Path) -> list[Row]:
 
 def _sphere(quick: bool, ax) -> list[Row]:
     jobs: list[tuple[int, str, np.ndarray]] = []
-    sizes = [4_000] if quick else [2_500, _N, 40_000]
+    sizes = [3_000] if quick else [2_500, _N, 40_000]
     judged = sizes[0] if quick else _N
     for n in sizes:
         scattered = np.random.default_rng(0).choice(n, 5, replace=False)

@@ -145,11 +145,11 @@ def _on_scan(name: str, cloud: js.PointCloud, t1: float) -> list[Row]:
 
 def run(quick: bool, out: Path) -> list[Row]:
     rows = _compared([300, 1_200] if quick else [500, 1_000, 2_000, 4_000])
-    rows += _cost(2_000 if quick else 20_000)
+    rows += _cost(1_200 if quick else 20_000)
     if not quick:
         cloud = surfaces.ellipsoid().cloud("jittered", 400)
         rows += _on_scan("ellipsoid, jittered", cloud, 20.0)
-    scans: list = [("bunny", data.bunny, 2_960)]
+    scans: list = [("bunny", data.bunny, 1_200 if quick else 2_960)]
     if not quick:
         scans += [("bunny", data.bunny, 10_000), ("Armadillo", data.armadillo, 10_000)]
         scans += [("bunny", data.bunny, 20_000), ("Armadillo", data.armadillo, 20_000)]

@@ -4,7 +4,8 @@ Of the cache environment variables tell, so that the commands that tests start h
 is not among them: those commands must ask for it themselves.
 
 Most of the time of a test is compilation, of programs that run for milliseconds. So they are
-optimised little here; the commands that tests start (experiments, demo) compile as users do.
+optimised little, here and in the experiments and notebooks that tests start. Those still take the
+form of stencils that users' own programs have, and what runs on several devices is optimised fully.
 """
 
 import importlib.util
@@ -16,9 +17,12 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # what is loaded from it was tuned: no news
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Workers share the cores: threads of LAPACK that wait for each other there take most of the time.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 _as_users = dict(os.environ)
 _quick = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
 os.environ["XLA_FLAGS"] = f"{_quick} {os.environ.get('XLA_FLAGS', '')}"
+_optimised_little = dict(os.environ)
 
 import jax
 import pytest
@@ -35,14 +39,19 @@ from jaxsurf import compiling
 
 @pytest.fixture(scope="session")
 def environment() -> dict[str, str]:
-    """For the commands that tests start."""
+    """For commands that are compiled as users do."""
     return _as_users
+
+
+@pytest.fixture(scope="session")
+def quick_environment() -> dict[str, str]:
+    """For commands that would be compiled for longer than they run."""
+    return _optimised_little
 
 
 # Files that test stencils in the form that runs faster, as users compile it in programs of theirs.
 THOROUGH = (
     "accuracy",
-    "discretization",
     "gradients",
     "moments",
     "operators",

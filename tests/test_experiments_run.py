@@ -14,9 +14,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_quick(name, tmp_path, environment):
+def test_quick(name, tmp_path, quick_environment):
     # Not double precision by the environment: the command itself must ask for it.
-    environment = {k: v for k, v in environment.items() if k != "JAX_ENABLE_X64"}
+    environment = {k: v for k, v in quick_environment.items() if k != "JAX_ENABLE_X64"}
     call = [sys.executable, "-m", "experiments", "run", name.lower(), "--quick", "--out", tmp_path]
     done = subprocess.run(call, cwd=ROOT, env=environment, capture_output=True, text=True)
     if "skipped" in done.stdout:

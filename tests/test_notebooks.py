@@ -21,7 +21,7 @@ def test_there_are_notebooks():
 
 @pytest.mark.skipif(bool(_MISSING), reason=_NEEDED)
 @pytest.mark.parametrize("path", _NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs(path, environment):
+def test_notebook_runs(path, quick_environment):
     import nbformat
     from nbclient import NotebookClient
 
@@ -34,6 +34,6 @@ def test_notebook_runs(path, environment):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the machinery that starts kernels
         client = NotebookClient(notebook, timeout=300, resources={"metadata": {"path": _FOLDER}})
-        client.execute(env=environment)
+        client.execute(env=quick_environment)
     printed = [output.get("name") for cell in code for output in cell.outputs]
     assert "stderr" not in printed, "a cell warns"

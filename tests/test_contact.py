@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 import jaxsurf as js
 from jaxsurf.moving import follow
-from jaxsurf.moving.contact import chambers, facing
+from jaxsurf.moving.contact import chambers, facing, watched
 from jaxsurf.moving.surgery import HermiteSurface, rejoined
 
 METHOD = js.GFDM(degree=2)
@@ -196,8 +196,8 @@ def test_sheets_are_kept_apart():
 
 
 def test_in_single_precision():
-    """The same sheets face each other, and what closes the cut is within 1e-5."""
-    cloud, found, values = with_a_waist(0.12), [], []
+    """The same sheets face each other; velocities and what closes the cut are within 1e-5."""
+    cloud, found, values, velocity = with_a_waist(0.12), [], [], []
     middle, y = np.zeros((1, 3)), RNG.uniform(-0.2, 0.2, (100, 3))
     near = np.abs(np.linalg.norm(cloud.points, axis=1) - 0.6) < 0.2
     for dtype in (jnp.float64, jnp.float32):
@@ -206,4 +206,13 @@ def test_in_single_precision():
         x, n = (np.asarray(a, float)[near] for a in (x, n))
         values.append(HermiteSurface(x, n, middle, np.array([0.25]), 0.07)(y)[0])
     np.testing.assert_array_equal(found[0].pairs, found[1].pairs)
+    one = spheres(60, ([0, 0, -1.3], [0, 0, 1.3]), (1.0, 1.0))
+    for dtype in (jnp.float64, jnp.float32):
+        x, n = one.points.astype(dtype), one.normals.astype(dtype)
+        near = js.PointCloud(x, n)
+        contact = js.Contact(0.5, kind="non-penetration")
+        apart = watched(contact, near, js.find_neighbors(near, k=9))[1]
+        velocity.append(apart.kept_apart(x, n, -x))
+    assert velocity[1].dtype == jnp.float32 and np.abs(velocity[0] - velocity[1]).max() < 1e-5
+    assert np.abs(velocity[0] + one.points).max() > 0.1
     assert len(found[0].pairs) and np.abs(values[0] - values[1]).max() < 1e-5

@@ -42,8 +42,10 @@ class Contact(eqx.Module):
             or more.
         kind: "delete" cuts out what touches and closes what is left: a neck pinches off, two drops
             become one, what is thinner everywhere vanishes. The new parts are the zero set of a
-            smooth function that passes through the points around with their normals. It needs
-            `adapt`, and a closed surface there. "non-penetration" takes away the velocity with
+            smooth function that passes through the points around with their normals; fields there
+            are means of those around, and with `Adaptation(conserve=True)` what was held by the
+            parts that go is spread over all that is left. It needs `adapt`, and a closed surface
+            there. "non-penetration" takes away the velocity with
             which sheets approach, half from each, more and more from twice the distance on.
 
     Accuracy: looks follow each other so that sheets come nearer by at most a fifth of the distance
@@ -205,8 +207,9 @@ def _others(contact: Contact, cloud: PointCloud, neighbors: Neighbors):
     indices[pairs[:, 0], slot], mask[pairs[:, 0], slot] = pairs[:, 1], True
     other = indices[:, 0]
     outside = np.where(np.sum((x - x[other]) * n[other], axis=1) < 0, -1.0, 1.0)
-    side, width = (jnp.asarray(a, cloud.points.dtype) for a in (outside, h))
-    return h, Faced(jnp.asarray(indices), jnp.asarray(mask), side, width, contact.distance)
+    numbers = (outside, h, contact.distance)
+    side, width, distance = (jnp.asarray(a, cloud.points.dtype) for a in numbers)
+    return h, Faced(jnp.asarray(indices), jnp.asarray(mask), side, width, distance)
 
 
 def _spacings(cloud: PointCloud, neighbors: Neighbors) -> Float[np.ndarray, " n"]:

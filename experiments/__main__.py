@@ -65,6 +65,10 @@ EXPERIMENTS = {
         "e16_dumbbell",
         "A dumbbell by mean curvature flow pinches off (paper 002, Fig. 14)",
     ),
+    "E17": (
+        "e17_torus",
+        "A torus by averaged mean curvature flow closes its hole (paper 002, Fig. 15)",
+    ),
     "E18": (
         "e18_expanding_wave",
         "Waves with a source on the expanding sphere, errors of space (paper 002, Table 4)",

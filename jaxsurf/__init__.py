@@ -55,8 +55,10 @@ from .moving.adaptation import adapt_points as adapt_points
 from .moving.contact import Contact as Contact
 from .moving.evolve import Evolution as Evolution
 from .moving.evolve import evolve as evolve
+from .moving.flows import MeanCurvatureFlow as MeanCurvatureFlow
+from .moving.flows import SurfaceDiffusionFlow as SurfaceDiffusionFlow
+from .moving.flows import WillmoreFlow as WillmoreFlow
 from .moving.motions import AbstractMotion as AbstractMotion
-from .moving.motions import MeanCurvatureFlow as MeanCurvatureFlow
 from .moving.motions import Motion as Motion
 from .neighbors import Neighbors as Neighbors
 from .neighbors import find_neighbors as find_neighbors

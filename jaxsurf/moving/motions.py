@@ -1,4 +1,4 @@
-r"""What moves a surface: a given velocity, or its own curvature."""
+r"""What moves a surface: velocities, their sums and multiples."""
 
 from __future__ import annotations
 
@@ -7,21 +7,20 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
-from ..arguments import instance
+from ..arguments import real
 from ..discretization import Discretization
-from ..stencils.algebra import AbstractOperator
+from ..failures import is_concrete
+from ..functions import numbers_as_arrays
 
 
 class AbstractMotion(eqx.Module):
     r"""A velocity of the points of a surface, normal and tangential.
 
-    A motion of one's own defines `velocity`. Where that holds derivatives of the positions,
-    explicit steps of the length that accuracy asks for are unstable: such a motion is `stiff`, and
-    may say by `pull` what implicit steps are to treat implicitly.
+    A motion of one's own defines `velocity`. Where that holds `derivatives` of the positions,
+    explicit steps of the length that accuracy asks for are unstable; `pull` says what implicit
+    steps are to treat implicitly. Motions are added, and multiplied by numbers.
 
     Example:
         >>> class Inflation(js.AbstractMotion):
@@ -32,17 +31,36 @@ class AbstractMotion(eqx.Module):
     """
 
     @property
-    def stiff(self) -> bool:
-        """True if velocity holds derivatives of the positions."""
-        return False
+    def derivatives(self) -> int:
+        """The highest order of derivatives of the positions that velocity holds."""
+        return 0
 
-    def pull(self, surface: Discretization) -> AbstractOperator | None:
-        """The stiff part of the velocity, as an operator on positions; None if there is none."""
+    def pull(self, surface: Discretization) -> Callable[[Array], Array] | None:
+        """The stiff part of the velocity, linear in positions; None if there is none or not known.
+
+        An operator or an equinox module, whose arrays are kept for a step.
+        """
         return None
 
     @abc.abstractmethod
     def velocity(self, t, surface: Discretization, fields: PyTree[Array], args) -> Array:
         """The velocity of the points `(n, d)`, in length / time."""
+
+    def __add__(self, other: AbstractMotion) -> AbstractMotion:
+        return MotionSum(self._parts + other._parts) if _is_motion(other) else NotImplemented
+
+    def __mul__(self, factor: ArrayLike) -> AbstractMotion:
+        if _is_motion(factor):
+            return NotImplemented
+        # Backwards, what smooths is ill-posed.
+        number = real(factor, "factor", above=0) if self.derivatives else real(factor, "factor")
+        return MotionSum([(number * share, motion) for share, motion in self._parts])
+
+    __rmul__ = __mul__
+
+    @property
+    def _parts(self) -> list[tuple[ArrayLike, AbstractMotion]]:
+        return [(1.0, self)]
 
 
 class Motion(AbstractMotion):
@@ -74,47 +92,47 @@ class Motion(AbstractMotion):
         return self.function(t, surface, fields, args)
 
 
-class MeanCurvatureFlow(AbstractMotion):
-    r"""Mean curvature flow $v = -H\,n$, with $H = \tfrac12\nabla\cdot n$, $v = \tfrac12\Delta x$.
+class MotionSum(AbstractMotion):
+    """Motions, each by a factor, one after another: what sums and multiples of motions are."""
 
-    A unit sphere shrinks as $r' = -1/r$. A curve moves by half its curvature.
-
-    Args:
-        keep_volume: add the mean of H along the normal, so that the enclosed volume is kept; closed
-            surfaces only.
-
-    Source: Suchde and Kuhnert 2019, eqs. 36 to 38.
-
-    Example:
-        >>> flow = js.MeanCurvatureFlow()
-        >>> end = js.evolve(flow, js.sphere(300), t1=0.1, method=js.GFDM(degree=4)).clouds[-1]
-        >>> bool(jnp.abs(jnp.linalg.norm(end.points, axis=1) - 0.8**0.5).max() < 1e-3)
-        True
-    """
-
-    keep_volume: bool = eqx.field(static=True)
-
-    def __init__(self, keep_volume: bool = False):
-        self.keep_volume = bool(instance(keep_volume, (bool, np.bool_), "keep_volume"))
+    parts: list[tuple[ArrayLike, AbstractMotion]] = eqx.field(converter=numbers_as_arrays)
 
     @property
-    def stiff(self):
-        return True
+    def _parts(self):
+        return self.parts
+
+    @property
+    def derivatives(self):
+        return max(motion.derivatives for _, motion in self.parts)
 
     def pull(self, surface):
-        return surface.laplacian / 2
+        pulls = [(factor, motion.pull(surface)) for factor, motion in self.parts]
+        known = [(factor, pull) for factor, pull in pulls if pull is not None]
+        return _Pulls(known) if known else None
 
     def velocity(self, t, surface, fields, args):
-        cloud = surface.cloud
-        toward: Float[Array, "n d"] = surface.laplacian(cloud.points) / 2
-        if not self.keep_volume:
-            return toward
-        outward = -jnp.sum(toward * cloud.normals, axis=1)
-        return toward + surface.mean(outward) * cloud.normals
+        each = [factor * m.velocity(t, surface, fields, args) for factor, m in self.parts]
+        return sum(each[1:], each[0])
+
+    def __repr__(self):
+        number = lambda x: f"{float(x):g}" if is_concrete(x) else "traced"
+        return " + ".join(f"{number(factor)} * {motion!r}" for factor, motion in self.parts)
+
+
+class _Pulls(eqx.Module):
+    parts: list[tuple[ArrayLike, Callable]]
+
+    def __call__(self, x):
+        each = [factor * pull(x) for factor, pull in self.parts]
+        return sum(each[1:], each[0])
+
+
+def _is_motion(value: Any) -> bool:
+    return isinstance(value, AbstractMotion)
 
 
 def checked_motion(motion: Any) -> AbstractMotion:
-    if not isinstance(motion, AbstractMotion):
+    if not _is_motion(motion):
         raise TypeError(
             f"motion is a {type(motion).__name__}, expected js.Motion(velocity) or "
             "js.MeanCurvatureFlow(), say"

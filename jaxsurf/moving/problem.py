@@ -15,9 +15,9 @@ from ..cloud import PointCloud
 from ..discretization import Discretization
 from ..functions import numbers_as_arrays
 from ..motion import carried, moved_cloud
-from ..stencils.algebra import AbstractOperator
 from ..stencils.stencil import Stencil
 from ..time.explicit import RKC2
+from ..time.implicit import IMEX
 from ..time.problem import AbstractEvolution
 from .contact import Faced
 from .motions import AbstractMotion
@@ -42,7 +42,7 @@ class Moving(AbstractEvolution):
     motion: AbstractMotion
     on: Callable | None
     faced: Faced | None = None
-    pull: AbstractOperator | None = None
+    pull: Callable[[Array], Array] | None = None
     problem: AbstractEvolution | None = None
 
     @classmethod
@@ -75,10 +75,12 @@ class Moving(AbstractEvolution):
     @property
     def operators(self):
         """Those of the fields are those of their own problem; points go where they are taken."""
-        return [self.gradient] if self.motion.stiff else []
+        return [self.gradient] if self.motion.derivatives else []
 
     def suggested_solver(self):
-        if self.motion.stiff:
+        if self.motion.derivatives > 2 and self.motion.pull(self.surface) is not None:
+            return IMEX(order=3), "IMEX(order=3): a velocity with derivatives of high order"
+        if self.motion.derivatives:
             return RKC2(), "RKC2: a velocity by curvature, by explicit steps with many stages"
         if self.on is None:
             return dfx.Tsit5(), "Tsit5: a velocity without derivatives is not stiff"

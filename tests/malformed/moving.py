@@ -31,6 +31,12 @@ def evolve(motion=None, cloud=None, **options):
     return js.evolve(motion, surface() if cloud is None else cloud, **({"t1": 1.0} | options))
 
 
+def bordered() -> js.PointCloud:
+    cloud = js.graph(lambda x, y: x * y, (10, 10))
+    edge = np.abs(np.asarray(cloud.points[:, :2])).max(axis=1) > 1 - 1e-9
+    return js.PointCloud(cloud.points, cloud.normals, boundary=edge)
+
+
 def heat(surface):
     return js.AdvectionDiffusionReaction(surface.laplacian)
 
@@ -78,6 +84,13 @@ CALLS = [
     ("MeanCurvatureFlow", "text", lambda: js.MeanCurvatureFlow(keep_volume="yes"), ("keep_volume", "yes")),
     ("MeanCurvatureFlow", "a number", lambda: js.MeanCurvatureFlow(keep_volume=1.0), ("keep_volume", "1.0")),
     ("MeanCurvatureFlow", "a cloud", lambda: js.MeanCurvatureFlow(surface().cloud), ("keep_volume", "PointCloud")),
+    ("SurfaceDiffusionFlow", "times text", lambda: "2" * js.SurfaceDiffusionFlow(), ("factor", "'2'")),
+    ("SurfaceDiffusionFlow", "backwards", lambda: -1 * js.SurfaceDiffusionFlow(), ("factor", "-1", "above 0")),
+    ("SurfaceDiffusionFlow", "on a surface with a border", lambda: js.evolve(js.SurfaceDiffusionFlow(), bordered(), t1=0.01), ("border",)),
+    ("WillmoreFlow", "times an array", lambda: js.WillmoreFlow() * np.ones(3), ("factor", "real number")),
+    ("WillmoreFlow", "times infinity", lambda: np.inf * js.WillmoreFlow(), ("factor", "inf")),
+    ("WillmoreFlow", "a sum backwards", lambda: -0.5 * (js.WillmoreFlow() + js.Motion(lambda t, s, f, a: s.cloud.points)), ("factor", "-0.5")),
+    ("evolve", "a motion plus a number", lambda: evolve(js.WillmoreFlow() + 0.1), ("WillmoreFlow", "float")),
 ]  # fmt: skip
 
 CASES = [Case(*case) for case in CALLS]

@@ -17,6 +17,7 @@ _FILLED = (
     f"{_A}test_spacing_may_follow_the_curvature_and_integrals_stay, "
     f"{_A}test_borders_stay_and_their_gaps_are_filled"
 )
+_F = "test_flows.py::"
 _C = "test_contact.py::"
 _MET = (
     f"{_C}test_what_faces_what, {_C}test_a_cut_leaves_closed_surfaces, "
@@ -86,6 +87,24 @@ TESTED: dict[str, dict[str, Entry]] = {
         "jit": "(made of operators, as the velocities of Motion are)",
         "vmap": "(made of operators, as the velocities of Motion are)",
         "float32": "(made of operators, as the velocities of Motion are)",
+        "bad input": "malformed",
+    },
+    "SurfaceDiffusionFlow": {
+        "value": f"{_F}test_bumps_decay_as_the_linear_theory_says, {_F}test_velocities_on_tori, "
+        f"{_F}test_energies_fall_on_the_way_to_a_sphere, {_F}test_curves",
+        "gradient": {"points": f"{_F}test_derivatives_through_a_flow"},
+        "jit": f"{_F}test_derivatives_through_a_flow",
+        "vmap": "(made of operators, as the velocities of Motion are)",
+        "float32": "(made of operators, as the velocities of Motion are)",
+        "bad input": "malformed",
+    },
+    "WillmoreFlow": {
+        "value": f"{_F}test_bumps_decay_as_the_linear_theory_says, {_F}test_velocities_on_tori, "
+        f"{_F}test_energies_fall_on_the_way_to_a_sphere, {_F}test_curves",
+        "gradient": "(made of operators, whose derivatives are tested)",
+        "jit": f"{_F}test_derivatives_through_a_flow",
+        "vmap": "(made of operators, as the velocities of Motion are)",
+        "float32": f"{_F}test_in_single_precision",
         "bad input": "malformed",
     },
 }  # fmt: skip

@@ -81,6 +81,10 @@ EXPERIMENTS = {
         "cahn_hilliard",
         "Cahn-Hilliard on a torus: mass, energy, growth of a mode against linear theory",
     ),
+    "curvature-orders": (
+        "curvature_orders",
+        "Mean curvature flow of ellipsoids: orders in time and space of positions, normals and H",
+    ),
     "eigenmodes": (
         "eigenmodes",
         "Study: eigenvalues on sphere, ellipsoid and torus against spectral references",

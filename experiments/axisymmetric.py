@@ -90,3 +90,35 @@ def narrowest(surface: js.Discretization, count: int = 8) -> float:
     nearest = np.argsort(np.linalg.norm(x, axis=1))[:count]
     found = surface.interpolate(surface.cloud.points, x[nearest] * np.array([1.0, 1.0, 0.0]))
     return float(np.mean(np.hypot(*np.asarray(found)[:, :2].T)))
+
+
+def nearest_on(profile: tuple[np.ndarray, np.ndarray], points) -> tuple[np.ndarray, ...]:
+    """The nearest points of the surface of a profile, the outward normals and H there.
+
+    Of a convex profile that meets the axis, with points off the axis; by Newton's method from the
+    nearest of many points of the profile.
+    """
+    curve = np.fft.rfft(np.stack(profile), axis=1) / len(profile[0])
+    curve[:, 1:] *= 2
+    waves = np.arange(curve.shape[1])
+
+    def at(u, order=0):
+        return np.real((curve * (1j * waves) ** order) @ np.exp(1j * np.outer(waves, u)))
+
+    x = np.asarray(points)
+    radius = np.hypot(x[:, 0], x[:, 1])
+    target = np.stack([radius, x[:, 2]])
+    fine = angles(16 * len(profile[0]))
+    places = at(fine)
+    u = fine[np.argmin(np.sum((target[:, :, None] - places[:, None]) ** 2, axis=0), axis=1)]
+    for _ in range(6):
+        away, first, second = at(u) - target, at(u, 1), at(u, 2)
+        u = u - np.sum(away * first, 0) / np.sum(first**2 + away * second, 0)
+    (r, z), first, second = at(u), at(u, 1), at(u, 2)
+    length = np.hypot(*first)
+    normal = np.stack([first[1], -first[0]]) / length
+    normal *= np.sign(np.sum(normal * (at(u) - places.mean(1, keepdims=True)), axis=0))
+    curvature = 0.5 * (normal[0] / r - np.sum(second * normal, axis=0) / length**2)
+    around = x[:, :2] / radius[:, None]
+    in_space = lambda pair: np.concatenate([around * pair[0][:, None], pair[1][:, None]], axis=1)
+    return in_space((r, z)), in_space(normal), curvature

@@ -16,7 +16,8 @@ _NEEDED = f"needs {', '.join(_MISSING)}: pip install 'jaxsurf[notebooks]'"
 
 @pytest.mark.core
 def test_there_are_notebooks():
-    assert [path.name for path in _NOTEBOOKS] == ["patterns.ipynb", "quickstart.ipynb"]
+    names = ["moving_surfaces", "patterns", "quickstart"]
+    assert [path.stem for path in _NOTEBOOKS] == names
 
 
 @pytest.mark.skipif(bool(_MISSING), reason=_NEEDED)

@@ -38,8 +38,8 @@ class Contact(eqx.Module):
 
     Args:
         distance: at which sheets touch, in length. For "delete" three to five spacings: a neck is
-            that thick when it pinches off, and must still carry stencils. For "non-penetration" two
-            or more.
+            that thick when it pinches off (or 1.2 times so: sheets may face each other at a slant),
+            and must still carry stencils. For "non-penetration" two or more.
         kind: "delete" cuts out what touches and closes what is left: a neck pinches off, two drops
             become one, what is thinner everywhere vanishes. The new parts are the zero set of a
             smooth function that passes through the points around with their normals; fields there

@@ -68,7 +68,8 @@ class SurfaceDiffusionFlow(AbstractMotion):
 
     Of a unit sphere, a bump of degree l decays at the rate $\lambda(\lambda - 2)/2$, $\lambda =
     l(l + 1)$. Semi-implicit by default: $\Delta(n\cdot\Delta x)\,n$ of the geometry at the start
-    of a step is treated implicitly.
+    of a step is treated implicitly. Points move along normals and crowd where the surface draws
+    together, which costs steps: long runs want `Adaptation`.
 
     Accuracy: velocities of order r with a `GFDM` of degree r = 4, 1 % on a torus (2, 1) of 1,600
     points. In float32, where a fourth derivative loses the digits that $h^4$ takes, radii of curves

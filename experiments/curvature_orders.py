@@ -76,7 +76,7 @@ def in_space(method: js.GFDM | js.DCPSE, order: int, sizes: list[int]) -> list[R
             setting,
             None,
             "profile",
-            order - 0.3,
+            order - 0.4,
             at_least=True,
         )
         for w, s in zip(_WHAT, found)

@@ -142,6 +142,23 @@ def test_rates_are_differentiable_in_every_array(name):
     check_derivatives(total, LAPLACIAN.weights, jnp.asarray(number), WAVE, step=1e-3)
 
 
+@pytest.mark.parametrize("adjoint", [None, dfx.ForwardMode()], ids=["reverse", "forward"])
+def test_derivatives_at_a_state_of_zeros(adjoint):
+    """Where an unknown initial state is often started from; the problem is linear."""
+
+    def last(u):
+        problem = js.AdvectionDiffusionReaction(LAPLACIAN, diffusivity=0.3)
+        return js.integrate(problem, u, t0=0.0, t1=0.1, dt0=0.02, adjoint=adjoint).ys[-1]
+
+    image = last(WAVE)
+    if adjoint is None:
+        slope = jax.grad(lambda u: jnp.vdot(X, last(u)))(0 * X)
+        assert abs(jnp.vdot(slope, WAVE) / jnp.vdot(X, image) - 1) < 1e-9
+    else:
+        slope = jax.jvp(last, (0 * X,), (WAVE,))[1]
+        assert relative_error(slope, image) < 1e-9
+
+
 def test_inverses_of_steps_under_transformations():
     """Of 1 - g L for two g at once, as one after the other; in single precision to 1e-4."""
     field = jnp.exp(X) * Y

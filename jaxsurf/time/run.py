@@ -16,7 +16,7 @@ from jaxtyping import Array, PyTree
 
 from ..arguments import instance, real, whole, within_round_off
 from ..failures import is_concrete
-from ..functions import canonical, numbers_as_arrays
+from ..functions import canonical, constant, numbers_as_arrays
 from .asked import check_coefficients, check_saves, checked_rate, checked_state, checked_times
 from .chebyshev import Loop
 from .explicit import RKC2
@@ -183,7 +183,7 @@ def planned(
         )  # fmt: skip
         event = _ending(event, arrays, now, told)
     saveat = _saving(saveat, arrays, now)
-    limit = _GROWN * root_mean_square(u0) if problem.contractive else jnp.asarray(jnp.inf, t0.dtype)
+    limit = _GROWN * root_mean_square(constant(u0)) if problem.contractive else jnp.asarray(jnp.inf, t0.dtype)
     parts = (terms, solver, t0, t1, dt0, u0, args, controller, limit, saveat, event, adjoint)
     concrete = is_concrete(parts, jnp.zeros(()) + 0)  # also not inside a `jit`
     _log.info("%s over [%s, %s] by %s", type(problem).__name__, t0, t1, why)

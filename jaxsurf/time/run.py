@@ -183,7 +183,8 @@ def planned(
         )  # fmt: skip
         event = _ending(event, arrays, now, told)
     saveat = _saving(saveat, arrays, now)
-    limit = _GROWN * root_mean_square(constant(u0)) if problem.contractive else jnp.asarray(jnp.inf, t0.dtype)
+    size = root_mean_square(constant(u0))
+    limit = _GROWN * size if problem.contractive else jnp.asarray(jnp.inf, t0.dtype)
     parts = (terms, solver, t0, t1, dt0, u0, args, controller, limit, saveat, event, adjoint)
     concrete = is_concrete(parts, jnp.zeros(()) + 0)  # also not inside a `jit`
     _log.info("%s over [%s, %s] by %s", type(problem).__name__, t0, t1, why)

@@ -46,6 +46,12 @@ from .film import animate as animate
 from .film import plot_series as plot_series
 from .frames import tangent_frames as tangent_frames
 from .ghosts import with_ghosts as with_ghosts
+from .inverse.invert import Inversion as Inversion
+from .inverse.invert import solve_inverse as solve_inverse
+from .inverse.posterior import Posterior as Posterior
+from .inverse.priors import AbstractPrior as AbstractPrior
+from .inverse.priors import GaussianPrior as GaussianPrior
+from .inverse.priors import MaternPrior as MaternPrior
 from .io import read as read
 from .io import read_fields as read_fields
 from .io import write as write

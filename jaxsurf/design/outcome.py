@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float, PyTree
@@ -69,7 +71,7 @@ class OptimizationError(RuntimeError):
 
     Args:
         message: why.
-        solution: what there is, a `ShapeOptimization` with the last good shape.
+        solution: what there is, a `ShapeOptimization` with the last good shape, or an `Inversion`.
 
     Example:
         >>> surface = js.discretize(js.sphere(200), method=js.GFDM(degree=2))
@@ -83,6 +85,6 @@ class OptimizationError(RuntimeError):
         True
     """
 
-    def __init__(self, message: str, solution: ShapeOptimization):
+    def __init__(self, message: str, solution: Any):
         super().__init__(message)
         self.solution = solution

@@ -30,6 +30,8 @@ _log = logging.getLogger(__name__)
 
 # Copies of the state kept for the reverse pass.
 _CHECKPOINTS = 64
+# Asked by programs while they are traced; JAX keeps those apart that were told otherwise.
+_forwards = jax.make_user_context(default_value=False)
 # A step this much shorter than the whole interval means that something diverges.
 _SHORTEST = 1e-11
 # Steps that are allowed when the number that are stored does not grow with it, and otherwise.
@@ -137,6 +139,11 @@ def solve(run: Run) -> tuple[dfx.Solution, Verdict | None]:
     return solution, verdict
 
 
+def forwards() -> Any:
+    """Within it, integrations that are traced have derivatives in forward mode, unless told how."""
+    return _forwards(True)
+
+
 def planned(
     problem, u0, t0, t1, *, solver, dt0, rtol, atol, controller, saveat, event, adjoint, args,
     max_steps, progress, throw,
@@ -157,7 +164,9 @@ def planned(
     if solver is None:
         solver, why = choose_solver(problem)
     name = type(solver).__name__
-    adjoint = dfx.RecursiveCheckpointAdjoint(_CHECKPOINTS) if adjoint is None else adjoint
+    if adjoint is None:
+        reverse = dfx.RecursiveCheckpointAdjoint(_CHECKPOINTS)
+        adjoint = dfx.ForwardMode() if _forwards.value else reverse
     if isinstance(solver, RKC2):
         solver = _looped(solver, adjoint)
     if controller is None and dt0 is None:

@@ -1,0 +1,1 @@
+"""Inverse problems: unknowns of a model from noisy data."""

@@ -1,0 +1,353 @@
+r"""One call from a model and noisy data to the likeliest unknowns, and how sure they are."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from ..arguments import as_float, floating, instance, real, whole
+from ..design.lagrangian import started, strong
+from ..design.outcome import OptimizationError
+from ..failures import needs_values, raise_at
+from .posterior import Posterior, posterior_of
+from .priors import AbstractPrior
+from .problem import (
+    Problem,
+    Seen,
+    along,
+    descent,
+    each,
+    free_columns,
+    is_prior,
+    newton,
+    pairs,
+    seen,
+    slope,
+)
+
+# A step is halved so often,
+_HALVINGS = 12
+# until J falls by this share of what its slope promises; differences of J below the second number,
+# which is nothing to a likelihood, are not looked at, as solves leave that much.
+_ARMIJO, _NOTHING = 1e-4, 1e-3
+# No step may be longer in any part of the white noise: what is likely before the data lies within.
+_LONGEST = 3.0
+# The first step of Gauss and Newton is solved for to this share, later ones better.
+_FORCING = 0.5
+# Unknowns are not told apart where data change by less than this many roots of the last digit.
+_SINGULAR = 10.0
+_COLUMNS = ("energy", "misfit", "gradient", "decrement", "linear_steps", "halved", "seconds")
+
+
+class Inversion(eqx.Module):
+    r"""The likeliest unknowns, and the way there: made by `solve_inverse`.
+
+    Args:
+        theta: the unknowns, as at the start.
+        predictions: of the data.
+        energy: $J$, minus the logarithm of the posterior density up to a constant.
+        misfit: $|(F(\theta) - d) / \sigma|^2$ over the number of data: about 1 where the model
+            and the noise are right, above where data are missed, below where noise is fitted.
+        history: by names `(steps + 1,)`: `energy`, `misfit`, norm of the `gradient`, `decrement`,
+            `linear_steps`, how often a step was `halved`, `seconds`.
+        converged: whether the tolerance was reached.
+        stopped: why it ended.
+
+    Example:
+        >>> times = jnp.linspace(0.1, 2, 40)
+        >>> decay = lambda rate: jnp.exp(-rate * times)
+        >>> found = js.solve_inverse(decay, jnp.array(1.0), decay(1.5), noise=0.01)
+        >>> found.converged, bool(abs(found.theta - 1.5) < 1e-3)
+        (True, True)
+    """
+
+    theta: PyTree[Array]
+    predictions: PyTree[Array]
+    energy: Float[Array, ""]
+    misfit: Float[Array, ""]
+    history: dict[str, np.ndarray]
+    converged: bool
+    stopped: str
+    problem: Problem
+    xi: PyTree[Array]
+
+    def posterior(self) -> Posterior:
+        """How sure the unknowns are.
+
+        It takes a linearised model for each of the data or unknowns, whichever are fewer, and
+        memory for the product of both numbers.
+
+        Raises:
+            ValueError: unknowns without a prior that the data do not tell apart there.
+        """
+        found = posterior_of(self.problem, self.xi, self.theta)
+        if not np.isfinite(found.rest).all():
+            raise ValueError(
+                "data do not tell the unknowns without a prior apart at what was found"
+            )
+        return found
+
+    def __repr__(self):
+        rows = self.history
+        return (
+            f"Inversion(misfit {float(self.misfit):.3g} a datum, energy {float(self.energy):.6g} "
+            f"from {rows['energy'][0]:.6g}, {len(rows['energy']) - 1} steps; {self.stopped})"
+        )
+
+
+def solve_inverse(
+    forward: Callable[..., PyTree[Array]],
+    theta: PyTree[Float[Array, "..."]],
+    data: PyTree[Float[Array, "..."]],
+    *,
+    noise: PyTree[Float[Array, "..."] | float],
+    prior: PyTree[AbstractPrior | None] = None,
+    args: tuple = (),
+    optimizer: optax.GradientTransformation | None = None,
+    steps: int = 100,
+    linear_steps: int = 200,
+    tol: float | None = None,
+    throw: bool = True,
+) -> Inversion:
+    r"""Unknowns of a model from noisy data: a coefficient, a source, an initial state, a rate.
+
+    Minimises $J = \tfrac12 |(F(\theta) - d) / \sigma|^2 + \tfrac12 |\xi|^2$ over white noise
+    $\xi$, with $\theta = \bar\theta + A \xi$ as the prior has it: minus the logarithm of the
+    posterior density. By default by the method of Gauss and Newton, its steps by conjugate
+    gradients with products of the linearised model and its adjoint, solved for the better the
+    nearer the minimum is (Eisenstat and Walker 1996), shortened to three deviations of the prior
+    and halved until J falls. The number of linear steps does not grow with the number of unknowns,
+    as the prior preconditions them.
+
+    Args:
+        forward: $F$, of the unknowns and `args`; returns what is measured, in any pytree. Of
+            `js.solve`, `js.integrate`, `surface.interpolate(u, sensors)` and what JAX has. For
+            unknowns that are positive take the exponential in it.
+        theta: where to start, any pytree of floating-point arrays.
+        data: $d$, as the model returns them.
+        noise: $\sigma$, standard deviations: a number, or like the data, or one for each array.
+        prior: as theta, of `js.GaussianPrior`, `js.MaternPrior`, or None for what the data have to
+            determine alone.
+        args: further arguments of the model; other values compile nothing.
+        optimizer: of optax, for steps of first order in $\xi$ instead: `optax.lbfgs()`, say. It
+            needs no forward mode, and more steps.
+        steps: at most.
+        linear_steps: of conjugate gradients a step, at most.
+        tol: it has converged where the step of Gauss and Newton (of first order: the gradient) is
+            this many standard deviations of the posterior long. If None 1e-3, in single precision
+            0.05.
+        throw: raise where it cannot go on; if False, see `stopped`.
+
+    Returns:
+        `Inversion`: `theta`, `predictions`, `misfit`, `history`; its `posterior()` has standard
+        deviations and samples. Steps that are used up are no error.
+
+    Accuracy: of the model and its derivatives, to `tol` deviations; of a rate in float32 to a
+        twentieth of one (`tests/test_inverse.py`).
+    Raises:
+        TypeError: a model, priors, an optimiser that are none; unknowns that are no floating-point
+            arrays; a model that has no derivative in forward mode, unless steps of first order
+            are asked for (`js.integrate` has both modes if it is not given an `adjoint`).
+        ValueError: data, noise or priors of other shapes than the model's; noise that is not
+            positive; data or predictions that are not finite (named by number); unknowns without
+            a prior on which the data do not depend, or that they do not tell apart: the system of
+            Gauss and Newton is singular; traced arrays.
+        OptimizationError: no step lowers J; its `solution` has the best unknowns so far.
+
+    Example:
+        >>> surface = js.discretize(js.sphere(400), method=js.GFDM(degree=2))
+        >>> x = surface.cloud.points
+        >>> def temperature(source):
+        ...     return js.solve(1 - surface.laplacian, source, mean_zero=False).value[::10]
+        >>> data = temperature(x[:, 2])
+        >>> prior = js.MaternPrior(surface, deviation=1.0, length=2.0)
+        >>> found = js.solve_inverse(
+        ...     temperature, jnp.zeros(400), data, noise=0.01, prior=prior)
+        >>> found.converged, bool(jnp.abs(found.theta - x[:, 2]).max() < 0.4)
+        (True, True)
+    """
+    if not callable(forward):
+        raise TypeError(f"forward is a {type(forward).__name__}, expected a function")
+    if optimizer is not None:
+        instance(optimizer, optax.GradientTransformation, "optimizer", "optax.lbfgs(), say")
+    steps = whole(steps, "steps", least=1)
+    linear_steps = whole(linear_steps, "linear_steps", least=1)
+    needs_values("theta, data, noise, prior and args", theta, data, noise, prior, args)
+    theta = strong(floating(theta, "theta"))
+    prior = _priors(prior, theta)
+    data = jax.tree.map(lambda d: as_float(d, "data"), data)
+    problem = Problem(forward, tuple(args), data, noise, prior, jax.tree.map(jnp.ones_like, theta))
+    problem = _with_noise(problem, theta)
+    dtype = jnp.result_type(*jax.tree.leaves(theta))
+    tol = (1e-3 if jnp.finfo(dtype).bits > 32 else 0.05) if tol is None else tol
+    tol = real(tol, "tol", above=0)
+    found, failed = _run(problem, theta, optimizer, steps, linear_steps, float(tol))
+    if failed and throw:
+        raise OptimizationError(found.stopped, found)
+    return found
+
+
+def _run(problem, theta, optimizer, steps, linear_steps, tol) -> tuple[Inversion, bool]:
+    """What is found, and whether it failed."""
+    clock = time.perf_counter()
+    rows: dict[str, list] = {name: [] for name in _COLUMNS}
+    look = seen if optimizer is None else slope
+    problem, xi, now = _start(problem, theta, look)
+    if optimizer is not None:
+        state = started(optimizer, xi)
+    first, forcing, stopped, failed = 0.0, _FORCING, "", False
+
+    def note(size, decrement, linear=0, halved=0):
+        m = now.residual.size
+        known = (now.energy, jnp.sum(now.residual**2) / m, size, decrement, linear, halved)
+        for name, x in zip(_COLUMNS, (*known, time.perf_counter() - clock)):
+            rows[name].append(float(x))
+
+    linear = halved = 0
+    while not stopped:
+        if optimizer is None:
+            step, gradient, falls, linear = newton(problem, xi, np.asarray(forcing), np.asarray(linear_steps))
+            size, decrement = optax.global_norm(gradient), jnp.sqrt(jnp.maximum(-falls, 0))
+        else:
+            step, state = descent(optimizer, problem, xi, now, state)
+            size = decrement = optax.global_norm(now.gradient)
+            falls = None
+        first = first or float(size)
+        forcing = min(_FORCING, max(float(size) / max(first, 1e-300), 1e-12) ** 0.5)
+        note(size, decrement, linear, halved)
+        if float(decrement) <= tol:
+            stopped = "converged"
+        elif not np.isfinite(float(decrement)):
+            stopped, failed = "the derivative of the model is not finite", True
+        elif len(rows["energy"]) > steps:
+            stopped = f"all {steps} steps used"
+        if stopped:
+            break
+        longest = max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(problem.known(step)))
+        for halved in range(_HALVINGS + 1):
+            scale = 0.5**halved * min(1.0, _LONGEST / max(longest, _LONGEST))
+            there = along(xi, step, scale)
+            then = look(problem, there)
+            bound = np.inf if falls is None else now.energy + _ARMIJO * scale * falls + _NOTHING
+            if np.isfinite(then.energy) and then.energy <= bound:
+                break
+        else:
+            stopped, failed = f"steps were halved {_HALVINGS} times, and none lowers J", True
+            break
+        xi, now = there, then
+    return _found(problem, xi, now, rows, stopped), failed
+
+
+def _found(problem: Problem, xi, now: Seen, rows, stopped: str) -> Inversion:
+    off = ravel_pytree(problem.data)[1](now.residual)
+    predictions = jax.tree.map(lambda d, s, r: d + s * r, problem.data, problem.noise, off)
+    history = {name: np.array(values) for name, values in rows.items()}
+    return Inversion(
+        problem.theta(xi), predictions, now.energy, jnp.mean(now.residual**2), history,
+        stopped == "converged", stopped, problem, xi,
+    )  # fmt: skip
+
+
+# --- what is asked ---------------------------------------------------------------------------
+
+
+def _structure(tree: PyTree) -> Any:
+    return jax.tree.structure(tree, is_leaf=is_prior)
+
+
+def _priors(prior, theta) -> PyTree:
+    """One prior or None for each array of the unknowns."""
+    for given in jax.tree.leaves(prior, is_leaf=is_prior):
+        if not is_prior(given):
+            instance(given, AbstractPrior, "prior", "js.GaussianPrior(deviation=1.0), say")
+    if prior is None:
+        return jax.tree.map(lambda _: None, theta)
+    have, want = _structure(prior), _structure(theta)
+    if have != want:
+        raise ValueError(
+            f"prior has the structure {have}, theta {want}: one prior or None for each array"
+        )
+    for given, x in pairs(prior, theta):
+        shape = x.shape if given is None else jax.eval_shape(given.whiten, x).shape
+        if shape != x.shape:
+            raise ValueError(f"prior belongs to unknowns of shape {shape}, theta has {x.shape}")
+    return prior
+
+
+def _with_noise(problem: Problem, theta) -> Problem:
+    """With standard deviations for all data, which the model has to predict."""
+    predicted = eqx.filter_eval_shape(problem.forward, theta, *problem.args)
+    have, want = _structure(problem.data), _structure(predicted)
+    if have != want:
+        raise ValueError(f"data have the structure {have}, forward returns {want}")
+    for d, f in zip(jax.tree.leaves(problem.data), jax.tree.leaves(predicted)):
+        if d.shape != f.shape:
+            raise ValueError(f"data have shape {d.shape}, forward returns {f.shape}")
+        raise_at(~np.isfinite(d).ravel(), "datum {i} is {v}, expected a number", np.ravel(d))
+    like = lambda s: jax.tree.map(lambda _: s, problem.data)
+    noise = problem.noise
+    if _structure(noise) != have:
+        if _structure(noise) != _structure(0):
+            raise ValueError(
+                f"noise has the structure {_structure(noise)}, expected a number or {have}"
+            )
+        noise = like(noise)
+
+    def spread(s, d):
+        s = as_float(s, "noise")
+        if s.shape not in ((), d.shape):
+            raise ValueError(f"noise has shape {s.shape}, expected one number or {d.shape}")
+        bad = ~(np.isfinite(s) & (np.asarray(s) > 0)).ravel()
+        raise_at(bad, "noise of datum {i} is {v:g}, expected a positive number", np.ravel(s))
+        return jnp.broadcast_to(s, d.shape).astype(d.dtype)
+
+    noise = jax.tree.map(spread, noise, problem.data)
+    return eqx.tree_at(lambda p: p.noise, problem, noise)
+
+
+def _start(problem: Problem, theta, look) -> tuple[Problem, PyTree, Seen]:
+    """White noise and what is seen there; unknowns without a prior in units that data can see."""
+    xi = strong(problem.whitened(theta))
+    now = look(problem, xi)
+    _refuse(problem, theta, now)
+    free = [x for prior, x in pairs(problem.prior, theta) if prior is None]
+    if not free or look is slope:
+        return problem, xi, now
+    m, z = now.residual.size, sum(x.size for x in free)
+    text = (
+        "the system of Gauss and Newton is singular; give them a prior, js.GaussianPrior(1.0), say"
+    )
+    if m < z:
+        raise ValueError(f"{m} data for {z} unknowns without a prior: {text}")
+    columns = np.asarray(free_columns(problem, xi))
+    sizes = np.linalg.norm(columns, axis=0)
+    raise_at(sizes == 0, f"no datum depends on unknown {{i}} of those without a prior: {text}")
+    least = np.linalg.svd(columns / sizes, compute_uv=False)[-1]
+    if not least > _SINGULAR * np.finfo(columns.dtype).eps ** 0.5:
+        raise ValueError(
+            f"data do not tell {z} unknowns without a prior apart: of changes of size one, in "
+            f"units that data can see, one changes them by {least:.1g} only: {text}"
+        )
+    units = iter(ravel_pytree(free)[1](jnp.asarray(1 / sizes, columns.dtype)))
+    unit = each(lambda prior, x: next(units) if prior is None else x, problem.prior, problem.unit)
+    problem = eqx.tree_at(lambda p: p.unit, problem, unit)
+    return problem, strong(problem.whitened(theta)), now
+
+
+def _refuse(problem: Problem, theta, now: Seen) -> None:
+    """Say what is not good at the start."""
+    if np.isfinite(now.energy):
+        return
+    problem.forward(theta, *problem.args)  # may say why
+    text = "the prediction of datum {i} is not finite at the first theta"
+    raise_at(~np.isfinite(now.residual), text)
+    raise ValueError("J is not finite at the first theta")

@@ -17,6 +17,8 @@ MADE_FOR_USERS = (
     | {
         "Spectrum",
         "Evolution",
+        "Inversion",
+        "Posterior",
         "Adapted",
         "TaylorRemainders",
         "ShapeOptimization",

@@ -31,6 +31,7 @@ from .problem import (
     newton,
     pairs,
     seen,
+    size_of,
     slope,
 )
 
@@ -220,10 +221,10 @@ def _run(problem, theta, optimizer, steps, linear_steps, tol) -> tuple[Inversion
             step, gradient, falls, linear = newton(
                 problem, xi, np.asarray(forcing), np.asarray(linear_steps)
             )
-            size, decrement = optax.global_norm(gradient), jnp.sqrt(jnp.maximum(-falls, 0))
+            size, decrement = size_of(gradient), jnp.sqrt(jnp.maximum(-falls, 0))
         else:
             step, state = descent(optimizer, problem, xi, now, state)
-            size = decrement = optax.global_norm(now.gradient)
+            size = decrement = size_of(now.gradient)
             falls = None
         first = first or float(size)
         forcing = min(_FORCING, max(float(size) / max(first, 1e-300), 1e-12) ** 0.5)

@@ -97,6 +97,10 @@ def inner(a: PyTree, b: PyTree) -> Float[Array, ""]:
     return jax.tree.reduce(jnp.add, products)
 
 
+def size_of(a: PyTree) -> Float[Array, ""]:
+    return jnp.sqrt(inner(a, a))
+
+
 def along(xi: PyTree, step: PyTree, scale: Any) -> PyTree:
     return jax.tree.map(lambda x, s: x + scale * s, xi, step)
 
@@ -169,10 +173,10 @@ def _newton(problem, xi, tolerance, max_steps):
         jax.eval_shape(lambda: xi),
         lx.positive_semidefinite_tag,
     )
-    size = optax.global_norm(gradient)
+    size = size_of(gradient)
     # lineax compares component by component, in which a right-hand side may pass through zero.
     small = jnp.where(size > 0, size, 1) * tolerance
-    solver = lx.CG(0.0, small, norm=optax.global_norm, max_steps=max_steps)
+    solver = lx.CG(0.0, small, norm=size_of, max_steps=max_steps)
     down = jax.tree.map(jnp.negative, gradient)
     found = lx.linear_solve(hessian, down, solver, throw=False)
     return found.value, gradient, inner(found.value, gradient), found.stats["num_steps"]

@@ -69,7 +69,7 @@ def test_single_precision():
 
 
 def test_a_linear_model_has_the_posterior_of_linear_algebra():
-    """A field with a prior and an offset without: mean, deviations and samples by dense matrices."""
+    """A field with a prior and an offset without: mean, deviations, samples by dense matrices."""
     surface, sigma = ball(), 0.02
     prior = js.MaternPrior(surface, deviation=1.0, length=1.5, mean=0.3)
     model = lambda theta: screened(theta["source"]) + theta["offset"]

@@ -283,9 +283,14 @@ def _priors(prior, theta) -> PyTree:
             f"prior has the structure {have}, theta {want}: one prior or None for each array"
         )
     for given, x in pairs(prior, theta):
-        shape = x.shape if given is None else jax.eval_shape(given.whiten, x).shape
+        if given is None:
+            continue
+        try:
+            shape = jax.eval_shape(given.whiten, x).shape
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"prior of unknowns of shape {x.shape}: {error}") from error
         if shape != x.shape:
-            raise ValueError(f"prior belongs to unknowns of shape {shape}, theta has {x.shape}")
+            raise ValueError(f"prior of unknowns of shape {x.shape}: it is of shape {shape}")
     return prior
 
 

@@ -77,13 +77,14 @@ class GaussianPrior(AbstractPrior):
         check(self.mean, lambda x: ~np.isfinite(x), "mean {v:g} of unknown {i} is not finite{more}")
 
     def color(self, xi):
-        return self.mean + self.deviation * xi
+        return (self.mean + self.deviation * xi).astype(jnp.result_type(xi))
 
     def whiten(self, theta):
-        return (theta - self.mean) / self.deviation
+        return ((theta - self.mean) / self.deviation).astype(jnp.result_type(theta))
 
     def variance(self, theta):
-        return jnp.broadcast_to(self.deviation, jnp.shape(theta)) ** 2
+        deviation = jnp.broadcast_to(self.deviation, jnp.shape(theta))
+        return deviation.astype(jnp.result_type(theta)) ** 2
 
 
 class MaternPrior(AbstractPrior):
@@ -148,7 +149,8 @@ class MaternPrior(AbstractPrior):
         self.operator = kappa**2 - laplacian
         self.preconditioner = multigrid(self.operator, mean_zero=False)
         self.tau = jnp.asarray(tau, self.mass.dtype)
-        self.mean = shaped(finite(as_float(mean, "mean"), "mean"), "mean", (), (surface.n,))
+        mean = shaped(finite(as_float(mean, "mean"), "mean"), "mean", (), (surface.n,))
+        self.mean = mean.astype(self.mass.dtype)
 
     def color(self, xi):
         mass = switched_off(self.operator.active, self.mass, 1)

@@ -113,6 +113,13 @@ def _inflated(t, surface, fields, args):
     return args * surface.cloud.normals
 
 
+_TIMES = np.linspace(0.1, 2.0, 20)
+
+
+def _decay(rate):
+    return jnp.exp(-rate * _TIMES)
+
+
 def _last(evolution):
     return evolution.clouds[-1].points
 
@@ -255,6 +262,15 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
             js.optimize_shape(
                 _reach, js.MappedShape(_scaled, m.surface), jnp.array(m.number), optimizer=_SGD,
                 args=(jnp.array(m.number),), steps=3,
+            ).theta
+        ),
+    ),
+    "solve_inverse": (
+        "closed",
+        "laplacian",
+        lambda m: (
+            js.solve_inverse(
+                _decay, jnp.array(0.5), jnp.exp(-m.number * _TIMES), noise=0.1
             ).theta
         ),
     ),

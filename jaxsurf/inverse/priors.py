@@ -149,8 +149,8 @@ class MaternPrior(AbstractPrior):
         self.operator = kappa**2 - laplacian
         self.preconditioner = multigrid(self.operator, mean_zero=False)
         self.tau = jnp.asarray(tau, self.mass.dtype)
-        mean = shaped(finite(as_float(mean, "mean"), "mean"), "mean", (), (surface.n,))
-        self.mean = mean.astype(self.mass.dtype)
+        known = shaped(finite(as_float(mean, "mean"), "mean"), "mean", (), (surface.n,))
+        self.mean = known.astype(self.mass.dtype)
 
     def color(self, xi):
         mass = switched_off(self.operator.active, self.mass, 1)

@@ -81,6 +81,10 @@ EXPERIMENTS = {
         "cahn_hilliard",
         "Cahn-Hilliard on a torus: mass, energy, growth of a mode against linear theory",
     ),
+    "conductivity": (
+        "conductivity",
+        "Inverse: a conductivity field on the bunny from 200 noisy sensors",
+    ),
     "curvature-orders": (
         "curvature_orders",
         "Mean curvature flow of ellipsoids: orders in time and space of positions, normals and H",

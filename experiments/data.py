@@ -8,7 +8,7 @@ import jaxsurf as js
 from jaxsurf.io import read
 
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data"
-_BUNNY = FOLDER / "stanford-bunny.obj"
+BUNNY = FOLDER / "stanford-bunny.obj"
 _ARMADILLO = FOLDER / "armadillo.obj"
 
 
@@ -18,7 +18,7 @@ def bunny(n: int | None = None) -> js.PointCloud:
     Raises:
         FileNotFoundError: the mesh is absent.
     """
-    return _scan(_BUNNY, n)
+    return _scan(BUNNY, n)
 
 
 def armadillo(n: int | None = None) -> js.PointCloud:

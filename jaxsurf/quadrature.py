@@ -36,6 +36,8 @@ _BATCH = 128
 # Newton steps from cells with straight sides to those on the surface: each squares what is left of
 # an error of the size (spacing x curvature)^2.
 _STEPS = 2
+# Sides that it puts so much farther out than straight ones, or behind the point, are not found.
+_STRETCH = 2.0
 # So many neighbours may bound a cell; where points are very uneven, all are tried.
 _CELLS = 24
 # Of these so many are its sides at most, or half of those that are tried.
@@ -249,7 +251,9 @@ def _moments(sides: Sides, graph: Graph, ways):
     The latter squared.
     """
     if graph.dim == 1:
-        return _along_ways(sides.chosen(ways[2]), graph, *ways[:2]), jnp.zeros_like(ways[1][0])
+        found, reach = _along_ways(sides.chosen(ways[2]), graph, *ways[:2])
+        # The nearest to either side bound a curve's cell, if it is found at all.
+        return found, jnp.where(reach < jnp.inf, 0, reach)
     side, still = ways
     of_first = lambda count: _over_sides(sides.chosen(side[:count]), still[:count], graph)
     few = len(side) // 2
@@ -277,12 +281,15 @@ def _over_sides(these: Sides, still, graph: Graph):
     share, weights = _gauss(_nodes(graph), 0)
     ends = jnp.concatenate([first + x * (last - first) for x in share], axis=1)
     again = jax.tree.map(lambda a: jnp.concatenate([a] * len(share), axis=-2), these)
-    found = _along_ways(again, graph, ends, jnp.concatenate([w * turn for w in weights]))
-    return found, jnp.max(jnp.sum(jax.lax.stop_gradient(last) ** 2, axis=0), axis=0)
+    found, reach = _along_ways(again, graph, ends, jnp.concatenate([w * turn for w in weights]))
+    corners = jnp.max(jnp.sum(jax.lax.stop_gradient(last) ** 2, axis=0), axis=0)
+    return found, jnp.maximum(corners, reach)
 
 
 def _along_ways(sides: Sides, graph: Graph, ends, measure):
-    """The moments from those of ways that end at sides.
+    """The moments from those of ways that end at sides, and how far these reach, squared.
+
+    That is infinite where the surface bends so much within the cell that a side is not found.
 
     Args:
         ends: of the ways if the sides were straight.
@@ -309,7 +316,10 @@ def _along_ways(sides: Sides, graph: Graph, ends, measure):
         square = square + jnp.tensordot(powers[:-1].T, along, 1) ** 2
     sums = jnp.tensordot(powers * share, jnp.sqrt(square), 1) * measure
     found = [jnp.sum(row * total, axis=1) for row, total in zip(rows, sums)]
-    return jnp.concatenate(found)
+    length, ends = jax.lax.stop_gradient((length, ends))
+    resolved = (length > 0) & (length < _STRETCH)
+    reach = jnp.where(resolved, jnp.sum(ends**2, axis=0), jnp.inf)
+    return jnp.concatenate(found), jnp.max(reach, axis=0)
 
 
 def _nodes(graph: Graph) -> int:

@@ -1,5 +1,7 @@
 """`js.discretize`: operators kept, integrals of high order, interpolation, moved surfaces."""
 
+import warnings
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -116,6 +118,26 @@ def test_a_border():
     open_cloud = js.discretize(cloud, surface.neighbors, method=js.GFDM(degree=2))
     with pytest.raises(ValueError, match=r"neighbours of point \d+ do not close its cell.*mark"):
         _ = open_cloud.areas
+
+
+def test_cells_that_the_surface_bends_within_are_not_taken_for_closed():
+    # Six narrow arms of 200 points: Newton's way from straight sides to those on the surface
+    # ends anywhere, and some cells had ten thousand times the area of all.
+    x = js.sphere(200).points
+    radius = lambda x: 1 + 0.6 * jnp.cos(6 * jnp.arctan2(x[1], x[0])) * (1 - x[2] ** 2) ** 2
+    level = lambda x: jnp.linalg.norm(x) - radius(x / jnp.linalg.norm(x))
+    points = jax.vmap(lambda x: radius(x) * x)(x)
+    outward = jax.vmap(jax.grad(level))(points)
+    cloud = js.PointCloud(points, outward / jnp.linalg.norm(outward, axis=1)[:, None])
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "no neighbourhood|the surface bends")
+        surface = js.discretize(cloud, method=js.GFDM(degree=2))
+        with pytest.warns(UserWarning, match="the cells of [0-9]+ points, the first"):
+            sizes = surface.cell_areas
+        with pytest.raises(ValueError, match="do not close its cell"):
+            _ = surface.areas
+    np.testing.assert_allclose(sizes.sum(), 24.1109, rtol=0.1)
+    assert sizes.max() < 10 * np.median(sizes)
 
 
 def test_derivatives_of_integrals():

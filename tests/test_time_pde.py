@@ -242,6 +242,22 @@ def test_misuse(arguments, message):
         js.AdvectionDiffusionReaction(**arguments)
 
 
+@pytest.mark.core
+def test_known_weights_of_the_mass_in_compiled_code():
+    @jax.jit
+    def rate(u):
+        return js.AdvectionDiffusionReaction(LAPLACIAN, mass=jnp.ones(600)).rate(0.0, u, None)
+
+    @jax.jit
+    def closed_over(u):
+        return js.AdvectionDiffusionReaction(LAPLACIAN, mass=WEIGHTS).rate(0.0, u, None)
+
+    WEIGHTS = jnp.ones(600)
+    problem = js.AdvectionDiffusionReaction(LAPLACIAN, mass=WEIGHTS)
+    for compiled in (rate, closed_over):
+        np.testing.assert_allclose(compiled(X), problem.rate(0.0, X, None), rtol=1e-10, atol=1e-10)
+
+
 def test_misuse_seen_in_the_rate():
     shape = js.AdvectionDiffusionReaction(LAPLACIAN, diffusivity=jnp.ones(3))
     with pytest.raises(ValueError, match=r"diffusivity has shape \(3,\)"):

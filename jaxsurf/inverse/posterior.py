@@ -17,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, PyTree
 
+from ..compiling import sized_jit
 from .problem import Problem, each, jacobian
 
 
@@ -90,7 +91,7 @@ def posterior_of(problem: Problem, xi: PyTree, mean: PyTree) -> Posterior:
     return Posterior(mean, problem, xi, known, factor, rest)
 
 
-@eqx.filter_jit
+@sized_jit
 def _factors(slopes, known, free: int):
     r"""$L^{-1} G_1$, and the root of what those without a prior add, $(T^{-1/2}, -B T^{-1/2})$."""
     if slopes.shape[0] > slopes.shape[1]:  # fewer rows with the same products
@@ -108,7 +109,7 @@ def _factors(slopes, known, free: int):
     return factor, rest.at[where].set(spread)
 
 
-@eqx.filter_jit
+@sized_jit
 def _deviation(posterior: Posterior):
     problem, xi = posterior.problem, posterior.xi
     unravel = ravel_pytree(xi)[1]
@@ -125,7 +126,7 @@ def _deviation(posterior: Posterior):
     return jax.tree.map(lambda v: jnp.sqrt(jnp.maximum(v, 0)), variance)
 
 
-@eqx.filter_jit
+@sized_jit
 def _samples(posterior: Posterior, key, count: int):
     unravel = ravel_pytree(posterior.xi)[1]
     linear = jax.linearize(posterior.problem.theta, posterior.xi)[1]

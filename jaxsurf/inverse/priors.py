@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arguments import as_float, finite, instance, real, shaped, switched_off
+from ..compiling import sized_jit
 from ..discretization import Discretization
 from ..failures import check, needs_values, not_positive
 from ..solve.precondition import AbstractPreconditioner, multigrid
@@ -168,7 +169,7 @@ class MaternPrior(AbstractPrior):
         return solve(self.operator, noise, preconditioner=inverse, mean_zero=False).value
 
 
-@eqx.filter_jit
+@sized_jit
 def _variance(prior: MaternPrior, n: int):
     r"""Row by row of $A$, the inverse being symmetric in the inner product of the masses."""
     mass = switched_off(prior.operator.active, prior.mass, 1)

@@ -176,7 +176,9 @@ def _newton(problem, xi, tolerance, max_steps):
     size = size_of(gradient)
     # lineax compares component by component, in which a right-hand side may pass through zero.
     small = jnp.where(size > 0, size, 1) * tolerance
-    solver = lx.CG(0.0, small, norm=size_of, max_steps=max_steps)
+    # Residuals from the recurrence: another product to renew them is as much again to compile, and
+    # steps are solved for to a few digits.
+    solver = lx.CG(0.0, small, norm=size_of, stabilise_every=None, max_steps=max_steps)
     down = jax.tree.map(jnp.negative, gradient)
     found = lx.linear_solve(hessian, down, solver, throw=False)
     return found.value, gradient, inner(found.value, gradient), found.stats["num_steps"]

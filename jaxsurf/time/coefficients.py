@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
@@ -135,6 +134,7 @@ def check_mass(
     mass = switched_off(on, finite(as_float(mass, "mass"), "mass", on))
     if mass.ndim != 1 or (n is not None and mass.shape != (n,)):
         raise ValueError(f"mass has shape {mass.shape}, expected ({'n' if n is None else n},)")
-    if is_concrete(mass) and not bool(jnp.sum(mass) > 0):
-        raise ValueError(f"the weights of the mass add up to {float(jnp.sum(mass))}, not to > 0")
+    # NumPy's sum: JAX's is traced within `jit`, also that of an array that is known.
+    if is_concrete(mass) and not (total := np.sum(np.asarray(mass))) > 0:
+        raise ValueError(f"the weights of the mass add up to {float(total)}, not to > 0")
     return mass

@@ -319,6 +319,8 @@ def _along_ways(sides: Sides, graph: Graph, ends, measure):
     length, ends = jax.lax.stop_gradient((length, ends))
     resolved = (length > 0) & (length < _STRETCH)
     reach = jnp.where(resolved, jnp.sum(ends**2, axis=0), jnp.inf)
+    # The line of a border passes through the point: there is nothing between them.
+    reach = jnp.where(sides.offset > 0, reach, 0)
     return jnp.concatenate(found), jnp.max(reach, axis=0)
 
 

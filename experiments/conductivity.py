@@ -36,7 +36,7 @@ _EARS = 1.5
 
 
 def true(x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Logarithm of the conductivity: between a fifth and five times."""
+    """Logarithm of the conductivity: between a quarter and four times one."""
     x = jnp.asarray(x)
     return 0.9 * jnp.sin(5 * x[:, 0] + 1) * jnp.cos(4 * x[:, 1]) + 0.5 * jnp.sin(6 * x[:, 2])
 

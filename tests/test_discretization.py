@@ -122,7 +122,7 @@ def test_a_border():
 
 def test_cells_that_the_surface_bends_within_are_not_taken_for_closed():
     # Six narrow arms of 200 points: Newton's way from straight sides to those on the surface
-    # ends anywhere, and some cells had ten thousand times the area of all.
+    # ends anywhere, and some cells had thousands of times the area of all.
     x = js.sphere(200).points
     radius = lambda x: 1 + 0.6 * jnp.cos(6 * jnp.arctan2(x[1], x[0])) * (1 - x[2] ** 2) ** 2
     level = lambda x: jnp.linalg.norm(x) - radius(x / jnp.linalg.norm(x))

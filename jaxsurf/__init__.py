@@ -33,11 +33,14 @@ from .design.harmonics import star_shape as star_shape
 from .design.optimize import optimize_shape as optimize_shape
 from .design.outcome import OptimizationError as OptimizationError
 from .design.outcome import ShapeOptimization as ShapeOptimization
+from .design.repulsion import medial_radius as medial_radius
+from .design.repulsion import tangent_point_energy as tangent_point_energy
 from .design.shape import AbstractShape as AbstractShape
 from .design.shape import LevelSetShape as LevelSetShape
 from .design.shape import MappedShape as MappedShape
 from .design.shape import NormalShape as NormalShape
 from .design.shape import rigid_motion as rigid_motion
+from .design.sobolev import sobolev_gradient as sobolev_gradient
 from .design.taylor import TaylorRemainders as TaylorRemainders
 from .design.taylor import taylor_remainders as taylor_remainders
 from .discretization import Discretization as Discretization
@@ -55,6 +58,7 @@ from .inverse.priors import MaternPrior as MaternPrior
 from .io import read as read
 from .io import read_fields as read_fields
 from .io import write as write
+from .live import LivePlot as LivePlot
 from .moving.adaptation import Adaptation as Adaptation
 from .moving.adaptation import Adapted as Adapted
 from .moving.adaptation import adapt_points as adapt_points

@@ -217,3 +217,35 @@ def test_single_precision():
     assert found.converged and found.theta.dtype == jnp.float32
     np.testing.assert_allclose(found.theta, 1.2, atol=1e-3)
     assert "steps" in repr(found) and "converged" in repr(found)
+
+
+def test_projected_parameters_stay_where_they_are_allowed():
+    """A box around the axes of an ellipsoid; the goal lies outside of it in one of them."""
+    box = lambda axes: optax.projections.projection_box(axes, 0.8, 1.2)
+    goal = jnp.array([1.5, 1.1, 0.9])
+    apart = lambda s: jnp.mean((s.cloud.points - goal * ball().cloud.points) ** 2)
+    seen = []
+    found = js.optimize_shape(
+        apart, js.MappedShape(scaled, ball()), jnp.array([1.3, 1.0, 1.0]),
+        optimizer=optax.sgd(2.0), project=box, rtol=1e-6,
+        callback=lambda now: seen.append(now.theta),
+    )  # fmt: skip
+    assert found.converged and max(float(axes.max()) for axes in seen) <= 1.2
+    np.testing.assert_allclose(found.theta, [1.2, 1.1, 0.9], atol=1e-5)
+
+
+def test_features_are_no_thinner_than_asked():
+    """Least height of a spheroid whose medial balls must have a radius of 0.4 at least.
+
+    The smallest radius of curvature of the spheroid (1, 1, c) is c², at the equator; the other
+    bound of balls is its half height.
+    """
+    thick = {"thick": lambda s: 1 - js.medial_radius(s) / 0.4}
+    height = lambda s: jnp.mean(s.cloud.points[:, 2] ** 2)
+    flat = lambda x, c: jnp.stack([x[0], x[1], c * x[2]])
+    found = js.optimize_shape(
+        height, js.MappedShape(flat, ball(400)), jnp.array(0.9), optimizer=LBFGS,
+        inequalities=thick, ctol=1e-3, rtol=1e-3,
+    )  # fmt: skip
+    assert found.converged
+    np.testing.assert_allclose(found.theta, np.sqrt(0.4), rtol=3e-2)

@@ -124,6 +124,10 @@ def _last(evolution):
     return evolution.clouds[-1].points
 
 
+def _smoothed(transformation, g):
+    return transformation.update(g, transformation.init(g))[0]
+
+
 def _heat(surface):
     return js.AdvectionDiffusionReaction(surface.laplacian)
 
@@ -249,6 +253,13 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
         "closed",
         "surface",
         lambda m: js.chamfer_distance(m.surface, 1.1 * m.cloud.points[::2]),
+    ),
+    "tangent_point_energy": ("closed", "surface", lambda m: js.tangent_point_energy(m.surface)),
+    "medial_radius": ("closed", "surface", lambda m: js.medial_radius(m.surface)),
+    "sobolev_gradient": (
+        "closed",
+        "surface",
+        lambda m: _smoothed(js.sobolev_gradient(m.surface, m.number), m.u),
     ),
     "star_shape": (
         "closed",

@@ -35,9 +35,9 @@ def constraints(given: Any, name: str) -> dict[str, Callable]:
     return dict(given)
 
 
-def check_asked(objective, shape, theta, optimizer, asked, callback, checkpoint) -> None:
-    for name, f in (("objective", objective), ("callback", callback)):
-        if not callable(f) and not (name == "callback" and f is None):
+def check_asked(functions, shape, optimizer, asked, checkpoint) -> None:
+    for name, f in functions.items():
+        if not callable(f) and (f is not None or name == "objective"):
             raise TypeError(f"{name} is a {type(f).__name__}, expected a function")
     instance(shape, AbstractShape, "shape", "js.star_shape(surface, 4) or js.MappedShape, say")
     instance(optimizer, optax.GradientTransformation, "optimizer", "optax.lbfgs(), say")

@@ -38,7 +38,7 @@ class Values(NamedTuple):
         violation: the largest of a constraint, in its units.
         lagrangian: what is minimised.
         gradient: of that, in the parameters.
-        size: the norm of the gradient.
+        size: the norm of the gradient; under a projection, of the step along it that this leaves.
         code: what is wrong: 0 nothing, 1 points that are not finite, 2 a fold, 3 a Lagrangian
             or gradient that is not, 4 lists of neighbours that no longer reach.
         worn: whether lists of neighbours should be found anew.
@@ -69,6 +69,7 @@ class Problem(eqx.Module):
     equalities: dict[str, Callable]
     inequalities: dict[str, Callable]
     args: tuple
+    project: Callable | None
 
     def measured(self, surface: Discretization) -> tuple[Array, dict, dict]:
         """Objective, equalities and inequalities."""
@@ -95,6 +96,10 @@ class Problem(eqx.Module):
         value = jnp.where(code > 0, jnp.nan, value)
         return value, (f, h, g, violation, code, worn, forces)
 
+    def projected(self, theta: PyTree) -> PyTree:
+        """The nearest parameters that are allowed."""
+        return theta if self.project is None else self.project(theta)
+
 
 def _judged(surface: Discretization) -> tuple[Array, Array]:
     """What is wrong with a surface, and whether its lists are worn."""
@@ -116,10 +121,15 @@ def evaluated(problem, theta, multipliers, updates=None, scale=1.0) -> tuple[PyT
 
 @sized_jit
 def _evaluated(problem: Problem, theta, multipliers, updates, scale):
-    theta = optax.apply_updates(theta, jax.tree.map(lambda u: scale.astype(u.dtype) * u, updates))
+    updates = jax.tree.map(lambda u: scale.astype(u.dtype) * u, updates)
+    theta = problem.projected(optax.apply_updates(theta, updates))
     differentiated = jax.value_and_grad(problem.lagrangian, has_aux=True)
     (value, (f, h, g, violation, code, worn, forces)), gradient = differentiated(theta, multipliers)
-    size = optax.global_norm(gradient)
+    size = optax.tree.norm(gradient)
+    if problem.project is not None:
+        # What a step along the gradient would change.
+        there = problem.projected(jax.tree.map(jnp.subtract, theta, gradient))
+        size = optax.tree.norm(jax.tree.map(jnp.subtract, theta, there))
     ill = ~(jnp.isfinite(value) & jnp.isfinite(size) & jnp.isfinite(violation))
     code = jnp.where((code == 0) & ill, 3, code)
     seen = Values(f, h, g, violation, value, gradient, size, code, worn, forces)

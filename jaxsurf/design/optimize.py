@@ -81,6 +81,7 @@ def optimize_shape(
     optimizer: optax.GradientTransformation,
     equalities: Mapping[str, Callable] | None = None,
     inequalities: Mapping[str, Callable] | None = None,
+    project: Callable[[PyTree], PyTree] | None = None,
     args: tuple = (),
     steps: int = 100,
     rtol: float = 1e-4,
@@ -107,10 +108,13 @@ def optimize_shape(
         equalities: $h(S) = 0$, functions like the objective by their names, of numbers or arrays;
             best of size one, like `lambda s: js.volume(s) - 1`.
         inequalities: $g(S) \le 0$, likewise.
+        project: takes parameters to the nearest that are allowed, at the start and after every
+            step of a first-order method: one of `optax.projections`, say.
         args: further arguments of all these; other values compile nothing, where other
             functions do.
         steps: at most.
-        rtol: it has converged where the gradient of the Lagrangian is this share of its first,
+        rtol: it has converged where the gradient of the Lagrangian, less what a projection takes of
+            it, is this share of its first,
         ctol: and constraints are kept to this.
         penalty: $\mu$ at first, in units of the objective over those of a constraint squared;
             if None ten times the first objective, at least 10: much less, and to give a
@@ -133,8 +137,8 @@ def optimize_shape(
             no floating-point arrays.
         ValueError: a first surface or value that is not good, in the words of `shape` or by name;
             numbers out of range; functions that return something else; traced arrays.
-        OptimizationError: no good step is left, or constraints contradict each other; its
-            `solution` has the last good shape.
+        OptimizationError: no good step is left, or constraints contradict each other; with the
+            last good shape as its `solution`.
 
     Example:
         >>> surface = js.discretize(js.sphere(300), method=js.GFDM(degree=2))
@@ -148,7 +152,8 @@ def optimize_shape(
         (True, True)
     """
     asked = constraints(equalities, "equalities"), constraints(inequalities, "inequalities")
-    check_asked(objective, shape, theta, optimizer, asked, callback, checkpoint)
+    functions = dict(objective=objective, project=project, callback=callback)
+    check_asked(functions, shape, optimizer, asked, checkpoint)
     theta = strong(floating(theta, "theta"))
     numbers = dict(
         steps=whole(steps, "steps", least=1),
@@ -158,7 +163,7 @@ def optimize_shape(
         renew=bool(renew),
     )
     needs_values("theta, shape, args and tolerances", theta, shape, args, numbers)
-    loop = _Loop(objective, *asked, tuple(args), optimizer, numbers, callback, checkpoint)
+    loop = _Loop(objective, *asked, project, tuple(args), optimizer, numbers, callback, checkpoint)
     found, failed = loop.run(shape, theta)
     if failed and throw:
         raise OptimizationError(found.stopped, found)
@@ -203,6 +208,7 @@ class _Loop(NamedTuple):
     objective: Callable
     equalities: dict[str, Callable]
     inequalities: dict[str, Callable]
+    project: Callable | None
     args: tuple
     optimizer: Any
     numbers: dict[str, Any]
@@ -246,7 +252,7 @@ class _Loop(NamedTuple):
 
     def problem(self, shape) -> Problem:
         held = shape if self.numbers["renew"] else _Held(shape)
-        return Problem(held, self.objective, self.equalities, self.inequalities, self.args)
+        return Problem(held, *self[:3], self.args, self.project)
 
     def first(self, problem, shape, theta) -> _Run:
         """At the start, if it is good."""

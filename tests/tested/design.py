@@ -7,6 +7,7 @@ _MOVED = {"points, normals": _FUN + "test_derivatives_in_the_geometry"}
 _HOST = "(host only: concrete arrays)"
 
 _OPT = "test_optimize.py::"
+_REP, _SOB = "test_repulsion.py::", "test_sobolev.py::"
 
 TESTED = {
     "optimize_shape": {
@@ -82,6 +83,37 @@ TESTED = {
         "jit": _CURVES,
         "vmap": _CURVES,
         "float32": _CURVES,
+        "bad input": "malformed",
+    },
+    **{
+        name: {
+            "value": _REP + value,
+            "gradient": {"points, normals": _REP + "test_derivatives"},
+            "jit": _REP + "test_compiled_mapped_and_in_single_precision",
+            "vmap": _REP + "test_compiled_mapped_and_in_single_precision",
+            "float32": _REP + "test_compiled_mapped_and_in_single_precision",
+            "bad input": "malformed",
+        }
+        for name, value in (
+            ("tangent_point_energy", "test_energy_of_a_torus_is_of_second_order"),
+            ("medial_radius", "test_medial_radii_in_closed_form"),
+        )
+    },
+    "LivePlot": {
+        "value": "test_live.py::test_it_shows_the_surface_and_the_way_there_every_so_many_steps",
+        "gradient": "(a picture)",
+        "jit": "(a picture)",
+        "vmap": "(a picture)",
+        "float32": "(a picture)",
+        "bad input": "malformed",
+    },
+    "sobolev_gradient": {
+        "value": _SOB + "test_harmonics_fall_by_their_eigenvalues, "
+        "test_sobolev.py::test_it_is_the_gradient_in_the_sobolev_inner_product",
+        "gradient": "(it transforms derivatives)",
+        "jit": _SOB + "test_bumps_are_smoothed_in_free_form_and_nothing_is_compiled_between_steps",
+        "vmap": _SOB + "test_single_precision_and_fields_with_components",
+        "float32": _SOB + "test_single_precision_and_fields_with_components",
         "bad input": "malformed",
     },
     "LevelSetShape": {

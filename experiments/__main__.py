@@ -110,6 +110,10 @@ EXPERIMENTS = {
         "Shapes: from a bumpy star to the sphere, by least area at fixed volume",
     ),
     "integrals": ("integrals", "Study: area, volume and integrals of curvature, by order"),
+    "shape-derivatives": (
+        "shape_derivatives",
+        "Shapes: derivatives of functionals of ellipsoids and tori against spectral references",
+    ),
     "sphere-flow": (
         "sphere_flow",
         "Mean curvature flow of the sphere until r = 0.3, against sqrt(1 - 2t)",
@@ -152,7 +156,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     if options.command == "list":
         for name, (_, title) in EXPERIMENTS.items():
-            print(f"{name:13s} {title}")
+            print(f"{name:18s} {title}")
         return 0
     known = {name.lower(): name for name in EXPERIMENTS}
     unknown = [name for name in options.names if name.lower() not in known]

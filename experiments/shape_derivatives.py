@@ -1,0 +1,190 @@
+r"""Derivatives of functionals in the shape, held against spectral references.
+
+Ellipsoids and tori, in their axes and radii and along their normals by a random polynomial; reverse
+mode through points, normals, stencils, areas, solves, eigenmodes and integrations in time.
+"""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import jaxsurf as js
+
+from . import galerkin
+from .report import Method, Row, method_name, slope
+
+_RADIUS, _TIME = 0.5, 0.1
+_BOUND, _DEFAULT = 1e-5, 1e-4
+# Of the reference, and of one to compare it with.
+_DEGREE, _COARSE = 12, 8
+_METHODS: list[Method] = [js.GFDM(degree=4), js.DCPSE(order=4)]
+
+
+def bump(x):
+    """A random polynomial, the same on every machine."""
+    rng = np.random.default_rng(0)
+    a, b, c = rng.normal(size=3), rng.normal(size=(3, 3)), rng.normal(size=3)
+    return a @ x + x @ b @ x + (c @ x) ** 3
+
+
+FIELDS = {
+    "load": lambda x: x[0] + x[1] * x[2],
+    "start": lambda x: 1 + x[0] + 0.5 * x[1] * x[2] - x[2] ** 2,
+    "weight": lambda x: 1 + 2 * x[0] - x[2] + x[1] * x[1],
+}
+
+
+def ellipsoid(x, theta):
+    """Of these axes, then along its normals."""
+    axes, size = theta
+    n = x / axes
+    return axes * x + size * bump(x) * n / jnp.linalg.norm(n)
+
+
+def torus(x, theta):
+    """Of these radii, then along its normals."""
+    radii, size = theta
+    y = galerkin.torus_map(x, radii)
+    core = galerkin.torus_map(x, radii * jnp.array([1.0, 0.0]))
+    return y + size * bump(x) * (y - core) / radii[1]
+
+
+# Map, parameters, directions in axes or radii and along normals, group of eigenvalues.
+CASES = {
+    "ellipsoid": (
+        ellipsoid,
+        (jnp.array([1.0, 0.8, 0.7]), 0.0),
+        jnp.array([0.3, -0.2, 0.4]),
+        (1, 3),
+    ),
+    "torus": (torus, (jnp.array([1.0, _RADIUS]), 0.0), jnp.array([0.3, 0.5]), (1, 2)),
+}
+
+
+def directions(name: str) -> dict[str, tuple]:
+    _, (size, _), dot, _ = CASES[name]
+    what = "axes" if name == "ellipsoid" else "radii"
+    return {what: (dot, 0.0), "normals": (0 * size, 1.0)}
+
+
+@functools.cache
+def reference(name: str, degree: int) -> dict[str, dict[str, tuple[float, float]]]:
+    F, theta, _, group = CASES[name]
+    base = galerkin.sphere(degree) if name == "ellipsoid" else galerkin.torus(1, _RADIUS, degree)
+    return {
+        what: galerkin.functionals(base, F, theta, dot, FIELDS, *group, _TIME)
+        for what, dot in directions(name).items()
+    }
+
+
+def functionals(name: str, n: int, method: Method, **tolerances) -> dict:
+    """The same of a discretisation, as functions of parameters."""
+    F, _, _, (first, last) = CASES[name]
+    cloud = js.sphere(n) if name == "ellipsoid" else js.torus(n, 1.0, _RADIUS)
+    shape = js.MappedShape(F, js.discretize(cloud, method=method))
+    load, start, weight = (jax.vmap(f)(cloud.points) for f in FIELDS.values())
+
+    def heat(surface):
+        problem = js.AdvectionDiffusionReaction(surface.laplacian)
+        u = js.integrate(problem, start, t1=_TIME, **tolerances).ys[-1]
+        return surface.inner(weight, u)
+
+    of_surface = {
+        "area": lambda s: s.areas.sum(),
+        "volume": js.volume,
+        "int H^2": lambda s: s.integrate(s.mean_curvature**2),
+        "eigenvalue group": lambda s: jnp.mean(
+            js.eigenmodes(s.laplacian, last + 1).values[first : last + 1]
+        ),
+        "compliance": lambda s: js.compliance(s, load, screening=1.0),
+        "heat content": heat,
+    }
+    return {key: lambda theta, f=f: f(shape(theta)) for key, f in of_surface.items()}
+
+
+def errors(name: str, n: int, method: Method, keys=None, **tolerances) -> dict:
+    """Relative errors of values and derivatives, by functional and direction."""
+    exact, (_, theta, *_) = reference(name, _DEGREE), CASES[name]
+    found = {}
+    for key, f in functionals(name, n, method, **tolerances).items():
+        if keys is not None and key not in keys:
+            continue
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            value, gradient = jax.value_and_grad(f)(theta)
+        for what, dot in directions(name).items():
+            pairs = zip(jax.tree.leaves(gradient), jax.tree.leaves(dot))
+            slope = sum(float(jnp.vdot(a, b)) for a, b in pairs)
+            wanted = exact[what][key]
+            found[key, what] = abs(float(value) / wanted[0] - 1), abs(slope / wanted[1] - 1)
+    return found
+
+
+def run(quick: bool, out: Path) -> list[Row]:
+    sizes = (500, 1_000) if quick else (2_500, 10_000)
+    names = ["ellipsoid"] if quick else list(CASES)
+    keys = {"area", "volume", "compliance"} if quick else None
+    rows, drawn = [], {}
+    for name in names:
+        fine, coarse = reference(name, _DEGREE), reference(name, _COARSE)
+        change = max(
+            abs(a / b - 1)
+            for what in fine
+            for key in fine[what]
+            for a, b in zip(coarse[what][key], fine[what][key])
+        )
+        rows.append(Row(f"change of the reference, degree {_COARSE} to {_DEGREE}, relative",
+                        float(change), {"surface": name}, None, "project", 1e-7))  # fmt: skip
+        for method in _METHODS[: 1 if quick else None]:
+            about = {"surface": name, "method": method_name(method)}
+            found = [errors(name, n, method, keys, rtol=1e-7, atol=1e-10) for n in sizes]
+            for key, what in found[0]:
+                pair = [each[key, what][1] for each in found]
+                order = slope([n**-0.5 for n in sizes], pair)
+                here = about | {"in": what, "n": sizes[-1]}
+                rows += [
+                    Row(f"derivative of {key}, relative error", pair[-1], here, 0.0, "Galerkin",
+                        None if quick else _BOUND),
+                    Row("error of the derivative, its order, at least", order,
+                        about | {"in": what, "of": key}, 4.0, "project", 2.0, at_least=True),
+                ]  # fmt: skip
+                drawn[name, method_name(method), key, what] = pair
+            if not quick:
+                # With the tolerances that nobody chose.
+                default = errors(name, sizes[-1], method, {"heat content"})
+                rows += [
+                    Row("derivative of heat content, relative error, default tolerances",
+                        error, about | {"in": what, "n": sizes[-1]}, 0.0, "Galerkin", _DEFAULT)
+                    for (_, what), (_, error) in default.items()
+                ]  # fmt: skip
+    if not quick:
+        _picture(out / "shape-derivatives.png", sizes, drawn)
+    return rows
+
+
+def _picture(path: Path, sizes, drawn) -> None:
+    """A panel for each surface and method."""
+    panels = list(dict.fromkeys(at[:2] for at in drawn))
+    figure, axes = plt.subplots(2, -(-len(panels) // 2), figsize=(9, 8), sharey=True,
+                                layout="constrained", squeeze=False)  # fmt: skip
+    for ax, panel in zip(axes.ravel(), panels):
+        for (*at, key, what), pair in drawn.items():
+            if tuple(at) == panel:
+                kind = "s--" if what == "normals" else "o-"
+                color = f"C{list(dict.fromkeys(k for *_, k, _ in drawn)).index(key)}"
+                label = f"{key}, {what}"
+                ax.loglog(sizes, pair, kind, color=color, label=label, markersize=4)
+        ax.axhline(_BOUND, color="k", linewidth=0.8, linestyle=":")
+        ax.set_title(", ".join(panel), fontsize="medium")
+        ax.set_xlabel("points")
+        ax.legend(frameon=False, fontsize=6, ncols=2)
+    axes[0, 0].set_ylabel("relative error of the derivative")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)

@@ -10,7 +10,9 @@ the holes. The ears, thinner than a coarse cloud resolves, carry no heater and n
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -105,8 +107,18 @@ def conduction(surface: js.Discretization, kappa):
     return laplacian.of_weights(weights.at[0].set(-weights[1:].sum(axis=0)))
 
 
-def run(quick: bool, out: Path) -> list[Row]:
-    n, heated, tol = (1_000, 2, 1e-2) if quick else (4_000, _HEATERS, None)
+class Experiment(NamedTuple):
+    """What is measured, with which noise, and what would be measured at a field."""
+
+    surface: js.Discretization
+    model: Callable
+    clean: np.ndarray
+    noisy: Array
+    sigma: float
+
+
+def experiment(n: int, heated: int) -> Experiment:
+    """On n points, with so many heaters."""
     points, triangles = scan()
     body = np.flatnonzero(points[:, 1] < _EARS)
     places = body[spread_out(points[body], _SENSORS)]
@@ -118,14 +130,27 @@ def run(quick: bool, out: Path) -> list[Row]:
     cloud = data.bunny(n)
     cloud = js.PointCloud(_UNIT * cloud.points, cloud.normals, boundary=cloud.boundary)
     surface = js.discretize(cloud, method=js.GFDM(degree=2))
-    x = cloud.points
-    given = heat(x, heaters)
+    given = heat(cloud.points, heaters)
 
     def model(log_conductivity):
         operator = conduction(surface, jnp.exp(log_conductivity))
         u = js.solve(_LOSS - operator, given, mean_zero=False).value
         return surface.interpolate(u, sensors)
 
+    return Experiment(surface, model, clean, noisy, sigma)
+
+
+def problem(n: int) -> tuple[Callable, Array]:
+    """The misfit as a function of the field alone, and a field: for benchmarks."""
+    surface, model, _, noisy, sigma = experiment(n, _HEATERS)
+    misfit = lambda field: jnp.mean(((model(field) - noisy) / sigma) ** 2)
+    return misfit, 0.5 * true(surface.cloud.points)
+
+
+def run(quick: bool, out: Path) -> list[Row]:
+    n, heated, tol = (1_000, 2, 1e-2) if quick else (4_000, _HEATERS, None)
+    surface, model, clean, noisy, sigma = experiment(n, heated)
+    x = surface.cloud.points
     off = (model(true(x)) - clean) / sigma
     prior = js.MaternPrior(surface, deviation=_SPREAD, length=_LENGTH)
     found = js.solve_inverse(model, jnp.zeros(n), noisy, noise=sigma, prior=prior, tol=tol)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import optax
+from jaxtyping import Array
 
 import jaxsurf as js
 
@@ -28,6 +30,16 @@ def mismatch(surface: js.Discretization, heard):
     return jnp.mean((values / heard - 1) ** 2)
 
 
+def ball(n: int) -> js.MappedShape:
+    return js.MappedShape(stretched, js.discretize(js.sphere(n), method=js.GFDM(degree=4)))
+
+
+def problem(n: int) -> tuple[Callable, Array]:
+    """The objective as a function of parameters alone, and parameters: for benchmarks."""
+    shape, heard = ball(n), jnp.asarray(ellipsoid_values(12, _COUNT))
+    return lambda axes: mismatch(shape(axes), heard), jnp.asarray(_START)
+
+
 def _picture(path: Path, found: js.ShapeOptimization, axes: np.ndarray) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3.8), layout="constrained")
     mode = js.eigenmodes(found.surface.laplacian, 5).functions[:, 4]
@@ -44,12 +56,11 @@ def _picture(path: Path, found: js.ShapeOptimization, axes: np.ndarray) -> None:
 
 def run(quick: bool, out: Path) -> list[Row]:
     n = 800 if quick else 3_000
-    surface = js.discretize(js.sphere(n), method=js.GFDM(degree=4))
     heard = jnp.asarray(ellipsoid_values(12, _COUNT))
     way = [np.asarray(_START)]
     found = js.optimize_shape(
         mismatch,
-        js.MappedShape(stretched, surface),
+        ball(n),
         jnp.asarray(_START),
         optimizer=optax.lbfgs(),
         args=(heard,),

@@ -6,6 +6,7 @@ over the sphere, and compared with the least for its volume, $(36 \pi V^2)^{1/3}
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import optax
+from jaxtyping import Array
 
 import jaxsurf as js
 
@@ -20,6 +22,7 @@ from .report import Row
 
 _DEGREE = 4
 _VOLUME = 4 * np.pi / 3
+_METHOD = js.GFDM(degree=2)
 
 
 def area(surface: js.Discretization):
@@ -51,6 +54,13 @@ def exact(theta, nodes: int = 48) -> tuple[float, float]:
     return float(weight @ stretched), float(weight @ r**3) / 3
 
 
+def problem(n: int) -> tuple[Callable, Array]:
+    """The objective as a function of parameters alone, and parameters: for benchmarks."""
+    star = js.star_shape(js.discretize(js.sphere(n), method=_METHOD), _DEGREE)
+    ball = jnp.zeros((_DEGREE + 1) ** 2).at[0].set(np.sqrt(4 * np.pi))
+    return lambda theta: area(star(theta)), ball + 0.3 * (jnp.asarray(bumpy()) - ball)
+
+
 def _picture(path: Path, start, found: js.ShapeOptimization, excess) -> None:
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.8), layout="constrained")
     for ax, surface, title in ((axes[0], start, "start"), (axes[1], found.surface, "end")):
@@ -71,8 +81,7 @@ def _picture(path: Path, start, found: js.ShapeOptimization, excess) -> None:
 
 def run(quick: bool, out: Path) -> list[Row]:
     n = 600 if quick else 2_000
-    method = js.GFDM(degree=2)
-    star = js.star_shape(js.discretize(js.sphere(n), method=method), _DEGREE)
+    star = js.star_shape(js.discretize(js.sphere(n), method=_METHOD), _DEGREE)
     theta = jnp.asarray(bumpy())
     way = [theta]
     found = js.optimize_shape(
@@ -91,7 +100,7 @@ def run(quick: bool, out: Path) -> list[Row]:
     rows = found.history
     # The lists of the sphere do not reach on it: made anew, for the picture.
     start = jax.jit(lambda theta: (star(theta).cloud.points, star(theta).cloud.normals))(theta)
-    start = js.discretize(js.PointCloud(*start), method=method)
+    start = js.discretize(js.PointCloud(*start), method=_METHOD)
     _picture(out / "isoperimetric.png", start, found, excess)
     about = {"n": n, "method": "GFDM(degree=2)", "parameters": len(theta)}
     seconds = np.diff(rows["seconds"])

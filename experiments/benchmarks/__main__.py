@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from ..report import table as rows_table
 from ..report import write_json
-from . import cases, heat, prompt
+from . import cases, heat, prompt, shapes
 
 # Measured on a 2-core machine of the same kind, one process each: build s and apply ms at 1e5.
 PEERS = {
@@ -141,7 +141,7 @@ def table(results: list[dict], quick: bool) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m experiments.benchmarks", description=__doc__)
     parser.add_argument(
-        "group", nargs="?", default="stencils", choices=["stencils", "heat", "prompt"]
+        "group", nargs="?", default="stencils", choices=["stencils", "heat", "prompt", "shapes"]
     )
     parser.add_argument("--quick", action="store_true", help="smaller sizes")
     parser.add_argument("--compadre", action="store_true",
@@ -155,7 +155,9 @@ def main() -> None:
         jax.config.update("jax_enable_x64", True)
         name, arguments = options.case
         module, _, function = name.rpartition(".")
-        case = getattr({"": cases, "heat": heat, "prompt": prompt}[module], function)
+        case = getattr(
+            {"": cases, "heat": heat, "prompt": prompt, "shapes": shapes}[module], function
+        )
         print(json.dumps(case(*json.loads(arguments))))
         return
     start, results = time.perf_counter(), []
@@ -164,6 +166,7 @@ def main() -> None:
         "stencils": lambda quick: plan(quick) + (beside if options.compadre else []),
         "heat": heat.plan,
         "prompt": prompt.plan,
+        "shapes": shapes.plan,
     }
     todo = [
         (name, arguments)
@@ -183,11 +186,12 @@ def main() -> None:
     if options.group == "heat":
         print(json.dumps(results, indent=1))
         return
-    text = table(results, options.quick)
-    (options.out / "benchmarks.md").write_text(text + "\n")
+    shaped = options.group == "shapes"
+    text = shapes.table(results) if shaped else table(results, options.quick)
+    (options.out / f"{options.group}.md").write_text(text + "\n")
     print(text)
     if options.readme:
-        begin, end = MARKS
+        begin, end = (mark.replace("benchmarks", "shapes") if shaped else mark for mark in MARKS)
         before, rest = README.read_text().split(begin)
         README.write_text(f"{before}{begin}\n{text}\n{end}{rest.split(end)[1]}")
 

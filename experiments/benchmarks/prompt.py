@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import statistics
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,6 +19,7 @@ import optax
 import jaxsurf as js
 
 from ..report import Row
+from .timing import clock
 
 N = 2_500
 _FIRST, _ABOVE = 3.0, 20.0
@@ -39,16 +39,6 @@ class _Compiler:
         if kind in _EVENTS:
             self.seconds += seconds
             self.programs += kind == "backend_compile_duration"
-
-
-def _clock(call: Callable) -> float:
-    """Seconds by the clock on the wall or of the processor, the fewer.
-
-    A busy machine keeps a process waiting: its own time is then nearer to what it takes alone.
-    """
-    wall, own = time.perf_counter(), time.process_time()
-    jax.block_until_ready(call())
-    return min(time.perf_counter() - wall, time.process_time() - own)
 
 
 def stretched(cloud: js.PointCloud) -> js.PointCloud:
@@ -469,15 +459,15 @@ def one(name: str, n: int) -> dict:
     for need in needs.split():
         jax.block_until_ready((getattr(made, need), getattr(other, need)))
     compiler = _Compiler()
-    first = _clock(lambda: call(made))
+    first = clock(lambda: call(made))
     programs = compiler.programs
     again, above = [], []
     for _ in range(5):
         before = compiler.seconds
-        again.append(_clock(lambda: call(made)))
+        again.append(clock(lambda: call(made)))
         above.append(min(again[-1], compiler.seconds - before))
     repeated = compiler.programs - programs
-    new = _clock(lambda: call(other))
+    new = clock(lambda: call(other))
     return {"first s": first, "again s": statistics.median(again),
             "above ms": 1e3 * statistics.median(above), "programs": programs,
             "programs again": repeated, "new s": new,

@@ -1,0 +1,88 @@
+"""Objectives of shapes: one value, one gradient, both compiled, and differences beside them."""
+
+from __future__ import annotations
+
+import importlib
+import statistics
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..__main__ import EXPERIMENTS
+from .timing import clock, peak_gib
+
+# Number of points that each is measured with, and in the quick form; None for a bar of its own.
+SIZES = {
+    "isoperimetric": (2_000, 600),
+    "hear-the-shape": (3_000, 800),
+    "hot-spot": (2_000, 600),
+    "neural-bunny": (2_000, 800),
+    "control": (1_000, 300),
+    "conductivity": (4_000, 1_000),
+    "vesicles": (1_500, 600),
+    "extremal-eigenvalue": (2_000, 600),
+}
+_STEP = 1e-4
+
+
+def plan(quick: bool) -> list[tuple[str, list]]:
+    todo = [("shapes.measured", [name, sizes[quick]]) for name, sizes in SIZES.items()]
+    return [*todo, *([] if quick else [("shapes.measured", ["isoperimetric", 100_000])])]
+
+
+def measured(name: str, n: int) -> dict:
+    """Seconds, memory and agreement of one objective, in a process of its own."""
+    warnings.simplefilter("ignore")
+    module = importlib.import_module(f"experiments.{EXPERIMENTS[name][0]}")
+    f, theta = module.problem(n)
+    rng = np.random.default_rng(0)
+    found = {"unknowns": sum(np.size(leaf) for leaf in jax.tree.leaves(theta))}
+    programs = {}
+    for key, function in (("value", f), ("gradient", jax.value_and_grad(f))):
+        lowered = jax.jit(function).lower(theta)
+        compiled: list = []
+        keep = lambda lowered=lowered, compiled=compiled: compiled.append(lowered.compile())
+        found[f"{key} compiled s"] = clock(keep)
+        programs[key] = program = compiled[0]
+        memory = program.memory_analysis().temp_size_in_bytes
+        call = lambda program=program: program(theta)
+        found[f"{key} temporary GiB"] = memory / 2**30
+        found[f"{key} s"] = statistics.median([clock(call) for _ in range(6)][1:])
+    _, gradient = programs["gradient"](theta)
+    # Along the gradient and something else, so that the derivative is not near zero by chance.
+    size = lambda tree: float(
+        np.sqrt(sum(np.sum(np.square(leaf)) for leaf in jax.tree.leaves(tree)))
+    )
+    steep, large = size(gradient), max(size(theta), 1e-3)
+    noise = jax.tree.map(lambda g: jnp.asarray(rng.normal(size=np.shape(g))), gradient)
+    both = lambda g, v: large * (g / steep + 0.3 * v / size(noise))
+    direction = jax.tree.map(both, gradient, noise)
+    along = sum(float(jnp.vdot(a, b)) for a, b in zip(*map(jax.tree.leaves, (gradient, direction))))
+
+    def difference(h):
+        at = lambda s: programs["value"](jax.tree.map(lambda t, v: t + s * v, theta, direction))
+        return float(at(h) - at(-h)) / (2 * h)
+
+    wanted = (4 * difference(_STEP / 2) - difference(_STEP)) / 3
+    return found | {"off": abs(along / wanted - 1), "peak GiB": peak_gib()}
+
+
+def table(results: list[dict]) -> str:
+    """The Markdown table that the README quotes."""
+    lines = [
+        "| objective | n | unknowns | value s | gradient s | / value | value, gradient compiled s "
+        "| peak GiB | off differences | these would take s |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for r in results:
+        (name, n), v = r["arguments"], r["result"]
+        lines.append(
+            f"| `{name}` | {n:,} | {v['unknowns']:,} | {v['value s']:.3g} | {v['gradient s']:.3g} "
+            f"| {v['gradient s'] / v['value s']:.1f} "
+            f"| {v['value compiled s']:.1f}, {v['gradient compiled s']:.1f} "
+            f"| {v['peak GiB']:.2f} | {v['off']:.0e} "
+            f"| {2 * v['unknowns'] * v['value s']:.3g} |"
+        )
+    return "\n".join(lines)

@@ -131,6 +131,10 @@ EXPERIMENTS = {
         "turing",
         "Turing patterns: growth rates on the sphere against theory, a pattern on the bunny",
     ),
+    "vesicles": (
+        "vesicles",
+        "Shapes: red blood cells, least bending energy at fixed area and reduced volume",
+    ),
     "waves": (
         "waves",
         "Waves: a standing wave on the sphere against the exact one, a drop on the Armadillo",

@@ -93,6 +93,10 @@ EXPERIMENTS = {
         "eigenmodes",
         "Study: eigenvalues on sphere, ellipsoid and torus against spectral references",
     ),
+    "extremal-eigenvalue": (
+        "extremal_eigenvalues",
+        "Shapes: from a long star to the sphere, by its first three eigenvalues (Hersch 1970)",
+    ),
     "geodesics": (
         "geodesics",
         "Distances by the heat method: the sphere against great circles, bands on the bunny",

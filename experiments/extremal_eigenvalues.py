@@ -35,8 +35,8 @@ def hersch(surface: js.Discretization):
 
 
 def long_and_bumpy() -> np.ndarray:
-    """Coefficients of the radius: twice as long as wide, with bumps of a tenth."""
-    theta = 0.1 * np.random.default_rng(0).normal(size=(_DEGREE + 1) ** 2)
+    """Coefficients of the radius: twice as long as wide, with bumps of a twelfth."""
+    theta = 0.08 * np.random.default_rng(0).normal(size=(_DEGREE + 1) ** 2)
     theta[:4] = [np.sqrt(4 * np.pi), 0, 0, 0]
     theta[6] = 0.9
     return theta

@@ -60,7 +60,7 @@ def unevenness(surface: js.Discretization) -> float:
     return float(jnp.sqrt(surface.mean((radius / mean - 1) ** 2)))
 
 
-def _picture(path: Path, start, found: js.ShapeOptimization, first: np.ndarray) -> None:
+def _picture(path: Path, start, found: js.ShapeOptimization, first, sphere: float) -> None:
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.8), layout="constrained")
     for ax, surface, title in ((axes[0], start, "start"), (axes[1], found.surface, "end")):
         mode = js.eigenmodes(surface.laplacian, 4).functions[:, 1]
@@ -69,6 +69,9 @@ def _picture(path: Path, start, found: js.ShapeOptimization, first: np.ndarray) 
     axes[2].semilogy(steps, np.abs(found.history["objective"] - 1), label="ratio of the sides - 1")
     axes[2].semilogy(steps, np.abs(1 - first), label=r"$1 - \lambda_1 A / 8\pi$")
     axes[2].semilogy(steps, found.history["gradient"], label="gradient")
+    axes[2].axhline(
+        sphere, color="k", linewidth=0.8, linestyle=":", label="ratio of the sphere - 1"
+    )
     axes[2].set_xlabel("step")
     axes[2].legend(fontsize=8, frameon=False)
     figure.savefig(path, dpi=130)
@@ -92,9 +95,9 @@ def run(quick: bool, out: Path) -> list[Row]:
         callback=lambda now: first.append(share(now.surface)),
     )
     print(found)
-    _picture(out / "extremal-eigenvalue.png", start, found, np.array(first))
     ratio, seconds = found.history["objective"], np.diff(found.history["seconds"])
     sphere = abs(float(hersch(star.base)) - 1)
+    _picture(out / "extremal-eigenvalue.png", start, found, np.array(first), sphere)
     about = {"n": n, "method": "GFDM(degree=4)", "parameters": len(theta)}
     return [
         Row("ratio of the sides at the start", ratio[0], about),

@@ -93,6 +93,10 @@ EXPERIMENTS = {
         "eigenmodes",
         "Study: eigenvalues on sphere, ellipsoid and torus against spectral references",
     ),
+    "extremal-eigenvalue": (
+        "extremal_eigenvalues",
+        "Shapes: from a long star to the sphere, by its first three eigenvalues (Hersch 1970)",
+    ),
     "geodesics": (
         "geodesics",
         "Distances by the heat method: the sphere against great circles, bands on the bunny",
@@ -134,6 +138,10 @@ EXPERIMENTS = {
     "turing": (
         "turing",
         "Turing patterns: growth rates on the sphere against theory, a pattern on the bunny",
+    ),
+    "vesicles": (
+        "vesicles",
+        "Shapes: red blood cells, least bending energy at fixed area and reduced volume",
     ),
     "waves": (
         "waves",

@@ -255,34 +255,45 @@ def _moments(sides: Sides, graph: Graph, ways):
         # The nearest to either side bound a curve's cell, if it is found at all.
         return found, jnp.where(reach < jnp.inf, 0, reach)
     side, still = ways
-    of_first = lambda count: _over_sides(sides.chosen(side[:count]), still[:count], graph)
-    few = len(side) // 2
-    # Few cells have more sides, and most blocks have none of these.
-    return jax.lax.cond(jnp.all(still[few - 1]), lambda: of_first(few), lambda: of_first(len(side)))
+    count, few = len(side), len(side) // 2
+    after = jnp.where(still, side[:1], jnp.roll(side, -1, axis=0))
+    # Few cells have sides in the second half, and most blocks have none of these. The one before
+    # each half has the corner at which it begins.
+    halves = np.minimum(np.arange(0, count, few)[:, None] + np.arange(-1, few), count - 1)
+    ended = [jnp.zeros((), bool), *(jnp.all(still[row[0]]) for row in halves[1:])]
+
+    def half(these):
+        side, after, ended = these
+        none = jnp.zeros((size, *side.shape[1:]), graph.coefficients.dtype)
+        of_sides = lambda: _over_sides(sides.chosen(side), sides.chosen(after), graph)
+        return jax.lax.cond(ended, lambda: (none, none[0]), of_sides)
+
+    size = polynomial_count(graph.dim, graph.degree)
+    found, reach = jax.lax.map(half, (side[halves], after[halves], jnp.stack(ended)))
+    return jnp.sum(found, axis=0), jnp.max(reach, axis=0)
 
 
-def _over_sides(these: Sides, still, graph: Graph):
-    """The moments of a cell: of the triangles between its point and each side.
+def _over_sides(these: Sides, those: Sides, graph: Graph):
+    """What triangles between the point and each side add to the moments of a cell.
 
     Args:
-        these: sides in turn; the last stands for all that follow.
-        still: whether a side is the last, which the first one cuts off.
+        these: sides in turn, of which the first is that before.
+        those: what cuts each of them off.
     """
-    those = jax.tree.map(lambda a: jnp.where(still, a[..., :1, :], jnp.roll(a, -1, axis=-2)), these)
 
     def newton(q, these, those, graph):
         (u, a), (v, b) = these.miss(graph, q), those.miss(graph, q)
         return q - _meeting(u, v, *jax.lax.stop_gradient((a, b)))
 
     straight = _meeting(these.offset, those.offset, these.flat, those.flat)
-    last = _root(newton, jax.lax.stop_gradient(straight), these, those, graph)
-    first = jnp.roll(last, 1, axis=1)
+    corners = _root(newton, jax.lax.stop_gradient(straight), these, those, graph)
+    first, last = corners[:, :-1], corners[:, 1:]
     turn = first[0] * last[1] - first[1] * last[0]
     share, weights = _gauss(_nodes(graph), 0)
     ends = jnp.concatenate([first + x * (last - first) for x in share], axis=1)
-    again = jax.tree.map(lambda a: jnp.concatenate([a] * len(share), axis=-2), these)
+    again = jax.tree.map(lambda a: jnp.concatenate([a[..., 1:, :]] * len(share), axis=-2), these)
     found, reach = _along_ways(again, graph, ends, jnp.concatenate([w * turn for w in weights]))
-    corners = jnp.max(jnp.sum(jax.lax.stop_gradient(last) ** 2, axis=0), axis=0)
+    corners = jnp.max(jnp.sum(jax.lax.stop_gradient(corners) ** 2, axis=0), axis=0)
     return found, jnp.maximum(corners, reach)
 
 

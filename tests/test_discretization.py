@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import SphericalVoronoi
 
 import jaxsurf as js
 
@@ -138,6 +139,33 @@ def test_cells_that_the_surface_bends_within_are_not_taken_for_closed():
             _ = surface.areas
     np.testing.assert_allclose(sizes.sum(), 24.1109, rtol=0.1)
     assert sizes.max() < 10 * np.median(sizes)
+
+
+def ringed(points, many: int):
+    """A point at the pole of a sphere of points, and around it a ring of so many."""
+    angle = 2 * np.pi * np.arange(many) / many
+    ring = np.sin(0.28) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    ring = np.concatenate([ring, np.full((many, 1), np.cos(0.28))], axis=1)
+    pole = np.array([[0.0, 0.0, 1.0]])
+    return np.concatenate([pole, ring, points[points[:, 2] < np.cos(0.4)]])
+
+
+@pytest.mark.parametrize("many", [7, 8, 9, 12])
+def test_cells_of_many_sides(many):
+    """Of the sphere they are those of Voronoi, whose areas SciPy knows."""
+    x = ringed(np.asarray(js.sphere(600).points), many)
+    exact = SphericalVoronoi(x)
+    exact.sort_vertices_of_regions()
+    assert len(exact.regions[0]) == many
+    surface = js.discretize(js.PointCloud(x, x), method=js.GFDM(degree=4))
+    np.testing.assert_allclose(surface.cell_areas, exact.calculate_areas(), rtol=1e-4)
+
+
+def test_derivatives_of_cells_of_many_sides():
+    x = jnp.asarray(ringed(np.asarray(js.sphere(300).points), 12))
+    surface = js.discretize(js.PointCloud(x, x), method=js.GFDM(degree=2))
+    sizes = lambda x: surface.moved(x, surface.cloud.normals).cell_areas[:13]
+    check_derivatives(lambda x: jnp.sum(sizes(x) ** 2), x)
 
 
 def test_derivatives_of_integrals():

@@ -85,6 +85,10 @@ EXPERIMENTS = {
         "conductivity",
         "Inverse: a conductivity field on the bunny from 200 noisy sensors",
     ),
+    "control": (
+        "control",
+        "Shapes: a flow that takes the sphere to a bean, by derivatives through its motion",
+    ),
     "curvature-orders": (
         "curvature_orders",
         "Mean curvature flow of ellipsoids: orders in time and space of positions, normals and H",

@@ -109,6 +109,10 @@ EXPERIMENTS = {
         "hear_the_shape",
         "Shapes: the axes of an ellipsoid from its first 12 eigenvalues",
     ),
+    "hot-spot": (
+        "hot_spot",
+        "Shapes: the closed surface on which a hot spot cools fastest, at fixed area",
+    ),
     "isoperimetric": (
         "isoperimetric",
         "Shapes: from a bumpy star to the sphere, by least area at fixed volume",

@@ -89,7 +89,7 @@ def _picture(path: Path, start, end, history) -> None:
     figure, axes = plt.subplots(1, 3, figsize=(11.5, 3.8), layout="constrained")
     for ax, surface, title in ((axes[0], start, "start"), (axes[1], end, "end")):
         js.plot_cloud(surface.cloud, heat(surface), ax=ax, title=title, limits=(0, 0.33),
-                      label="temperature", view=(0.8, -1.2, 1.0), cmap="inferno")  # fmt: skip
+                      label="temperature", view=(1.6, -0.5, 1.0), cmap="inferno")  # fmt: skip
     axes[2].plot(history["objective"] / exact(), label="temperature over that on the sphere")
     axes[2].axhline(1 / (_AREA * exact()), color="k", linewidth=0.8, linestyle=":",
                     label="1 / area")  # fmt: skip
@@ -101,7 +101,7 @@ def _picture(path: Path, start, end, history) -> None:
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    n, steps = (600, 30) if quick else (2_500, 100)
+    n, steps = (600, 30) if quick else (4_000, 100)
     sphere = ball(n)
     star = js.star_shape(sphere, _DEGREE)
     found = js.optimize_shape(

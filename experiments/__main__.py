@@ -85,6 +85,10 @@ EXPERIMENTS = {
         "conductivity",
         "Inverse: a conductivity field on the bunny from 200 noisy sensors",
     ),
+    "control": (
+        "control",
+        "Shapes: a flow that takes the sphere to a bean, by derivatives through its motion",
+    ),
     "curvature-orders": (
         "curvature_orders",
         "Mean curvature flow of ellipsoids: orders in time and space of positions, normals and H",
@@ -108,6 +112,10 @@ EXPERIMENTS = {
     "hear-the-shape": (
         "hear_the_shape",
         "Shapes: the axes of an ellipsoid from its first 12 eigenvalues",
+    ),
+    "hot-spot": (
+        "hot_spot",
+        "Shapes: the closed surface on which a hot spot cools fastest, at fixed area",
     ),
     "isoperimetric": (
         "isoperimetric",

@@ -171,6 +171,24 @@ def test_numbers_that_are_none():
     assert 1 <= float(size(found.surface)) < 1.05
 
 
+def test_steps_to_where_an_integration_diverges_are_halved():
+    """Heat made as the square of the temperature has no end where a surface is large."""
+    shape = js.MappedShape(scaled, ball())
+
+    def cold(surface):
+        heated = js.AdvectionDiffusionReaction(
+            surface.laplacian, reaction=lambda t, u, args: args * u**2
+        )
+        u = js.integrate(heated, jnp.ones(surface.n), t1=1.0, args=size(surface)).ys[-1]
+        return -size(surface) + 0 * jnp.sum(u)
+
+    found = js.optimize_shape(
+        cold, shape, 0.8 * jnp.ones(3), optimizer=optax.sgd(0.3), throw=False, steps=4
+    )
+    assert found.history["refused"].max() > 0
+    assert 0.64 < float(size(found.surface)) < 1.0
+
+
 def test_free_form_keeps_its_parameters_where_the_reference_is_another():
     """Displacements are sums along the way; the reference is where neighbours were found last."""
     shape = js.NormalShape(ball())

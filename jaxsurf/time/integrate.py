@@ -2,6 +2,8 @@ r"""One call from a problem and a state to a solution in time."""
 
 from __future__ import annotations
 
+import functools
+import operator
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, PyTree
 
 from ..arguments import instance, real
-from ..failures import check, not_finite
+from ..failures import check, is_marking, not_finite, refuse
 from ..functions import numbers_as_arrays
 from ..solutions import told
 from .checkpoint import Checkpoint, integrate_in_parts
@@ -192,8 +194,14 @@ def _finished(plan: Plan, run: Run, throw: bool) -> dfx.Solution:
     solution = eqx.tree_at(
         lambda s: (s.ts, s.ys, s.stats), solution, (ts, ys, stats), is_leaf=lambda x: x is None
     )
-    good = (dfx.RESULTS.successful, dfx.RESULTS.event_occurred)
-    if not plan.concrete or any(solution.result == r for r in good):
+    results = (dfx.RESULTS.successful, dfx.RESULTS.event_occurred)
+    good = functools.reduce(operator.or_, (solution.result == r for r in results))
+    if not plan.concrete:
+        if not (throw and is_marking()):
+            return solution
+        ended = lambda y: refuse(y, ~good, "the end was not reached")
+        return eqx.tree_at(lambda s: s.ys, solution, jax.tree.map(ended, solution.ys))
+    if good:
         return solution
     if verdict is not None and not bool(verdict.stable):
         if throw:

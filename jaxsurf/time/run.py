@@ -15,7 +15,7 @@ import optimistix as optx
 from jaxtyping import Array, PyTree
 
 from ..arguments import instance, real, whole, within_round_off
-from ..failures import is_concrete
+from ..failures import is_concrete, is_marking
 from ..functions import canonical, constant, numbers_as_arrays
 from .asked import check_coefficients, check_saves, checked_rate, checked_state, checked_times
 from .chebyshev import Loop
@@ -197,7 +197,8 @@ def planned(
     parts = (terms, solver, t0, t1, dt0, u0, args, controller, limit, saveat, event, adjoint)
     concrete = is_concrete(parts, jnp.zeros(()) + 0)  # also not inside a `jit`
     _log.info("%s over [%s, %s] by %s", type(problem).__name__, t0, t1, why)
-    run = Run(*parts, allowed, bool(progress), bool(throw) and not concrete)
+    throw = bool(throw) and not concrete and not is_marking()
+    run = Run(*parts, allowed, bool(progress), throw)
     return Plan(run, name, f"{name}: given" if why == "given" else why, concrete)
 
 

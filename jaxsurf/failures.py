@@ -29,6 +29,11 @@ def marking() -> Any:
     return _marking(True)
 
 
+def is_marking() -> bool:
+    """Whether what is being traced is to put NaN where there is anything bad."""
+    return _marking.value
+
+
 def is_concrete(*trees: Any) -> bool:
     """True if no array in these is being traced, so that their values can be looked at."""
     return not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(trees))

@@ -30,7 +30,7 @@ def marking() -> Any:
 
 
 def is_marking() -> bool:
-    """Whether what is traced now is to go on with NaN."""
+    """Whether what is being traced is to put NaN where there is anything bad."""
     return _marking.value
 
 

@@ -189,6 +189,16 @@ def test_steps_to_where_an_integration_diverges_are_halved():
     assert 0.64 < float(size(found.surface)) < 1.0
 
 
+def test_steps_without_modes_are_halved():
+    """Eigenvalues of a surface that folds are none: the step is refused, the run goes on."""
+    shape = js.MappedShape(rippled, ball())
+    lowest = lambda surface: -js.eigenmodes(surface.laplacian, 2).values[1]
+    found = js.optimize_shape(
+        lowest, shape, jnp.array(0.1), optimizer=optax.sgd(10.0), steps=2, throw=False
+    )
+    assert found.history["refused"][1] > 0 and np.isfinite(found.objective)
+
+
 def test_free_form_keeps_its_parameters_where_the_reference_is_another():
     """Displacements are sums along the way; the reference is where neighbours were found last."""
     shape = js.NormalShape(ball())

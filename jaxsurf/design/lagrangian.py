@@ -136,8 +136,14 @@ def _evaluated(problem: Problem, theta, multipliers, updates, scale):
     return strong((theta, seen))
 
 
-def direction(optimizer, problem, theta, multipliers, values: Values, state) -> tuple[PyTree, Any]:
-    """Updates of the parameters and the state of the optimiser, which may search along a line."""
+def direction(
+    optimizer, look: Callable[[PyTree], Values], theta, values: Values, state
+) -> tuple[PyTree, Any]:
+    """Updates of the parameters and the state of the optimiser, which may search along a line.
+
+    Args:
+        look: what is seen at other parameters.
+    """
     try:
         return _direction(optimizer, theta, values, state)
     except _Searches:
@@ -149,7 +155,7 @@ def direction(optimizer, problem, theta, multipliers, values: Values, state) -> 
 
     def seen(theta):
         with jax.disable_jit(False):
-            values = evaluated(problem, theta, multipliers)[1]
+            values = look(theta)
         return values.lagrangian, values.gradient
 
     slopes = lambda gradient, scale: (jax.tree.map(lambda g: scale * g, gradient),)

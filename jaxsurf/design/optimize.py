@@ -98,7 +98,9 @@ def optimize_shape(
     gradient has fallen tenfold, or every 20 steps, and a penalty that grows fourfold where that
     does not serve. Steps after which the surface folds or a number is not finite are halved.
     Neighbours are found anew once the surface was sheared or stretched by about an eighth
-    (`AbstractShape.renewed`); the optimiser keeps its state, and nothing is compiled again.
+    (`AbstractShape.renewed`), points are chosen anew where a level set in `bounds` has other parts
+    (`js.LevelSetShape`); the optimiser keeps its state, and nothing is compiled again. Only L-BFGS
+    begins again where the points that are chosen cannot follow back to the step before.
 
     Args:
         objective: $f(S)$, of a `Discretization` and `args`; returns a number.
@@ -119,8 +121,9 @@ def optimize_shape(
         penalty: $\mu$ at first, in units of the objective over those of a constraint squared;
             if None ten times the first objective, at least 10: much less, and to give a
             constraint up may cost less than to keep it.
-        renew: find neighbours anew. If False they are those of `shape`, and known to the program,
-            as `js.solve` asks for without a preconditioner.
+        renew: find neighbours anew, and points where there are other parts. If False they are
+            those of `shape`, and known to the program, as `js.solve` asks for without a
+            preconditioner.
         callback: called with the `ShapeOptimization` so far after each step; True ends it.
         checkpoint: where all is written after every so many steps; if the file is there, the same
             run goes on from it and ends in the same bits.
@@ -218,6 +221,7 @@ class _Loop(NamedTuple):
     def run(self, shape: AbstractShape, theta) -> tuple[ShapeOptimization, bool]:
         """What is found, and whether it failed."""
         clock, renew = time.perf_counter(), self.numbers["renew"]
+        shape = shape.rebuilt(theta) if renew else shape
         try:
             surface = shape(theta)
         except ValueError:
@@ -279,23 +283,28 @@ class _Loop(NamedTuple):
             eqx.filter(shape, eqx.is_array), values.size, np.array(_GOAL), zero,
             np.array(np.inf), zero, history,
         )  # fmt: skip
-        _note(run, refused=0, renewed=0)
+        _note(run, refused=0, renewed=0, rebuilt=0)
         history["seconds"][0] = 0.0
         return run
 
     def step(self, problem, shape, run: _Run, search) -> tuple[_Run, AbstractShape, str]:
         """One step, what it asks for, and why there is none."""
-        updates, state = direction(
-            self.optimizer, problem, run.theta, run.multipliers, run.values, run.state
-        )
+
+        def look(theta, *updates):
+            theta, values = evaluated(problem, theta, run.multipliers, *updates)
+            return self.covered(shape, theta, values, run.multipliers, search), theta
+
+        # A search along a line goes on to where there are other parts.
+        beyond = lambda theta: look(theta)[0][1]
+        updates, state = direction(self.optimizer, beyond, run.theta, run.values, run.state)
         for refused in range(_HALVINGS + 1):
-            half = 0.5**refused
-            theta, values = evaluated(problem, run.theta, run.multipliers, updates, half)
-            if not int(values.code):
+            (covering, values, ill), theta = look(run.theta, updates, 0.5**refused)
+            if not ill:
                 break
         else:
-            why = f"steps were halved {_HALVINGS} times, and still {ILL[int(values.code)]}"
+            why = f"steps were halved {_HALVINGS} times, and still {ill}"
             return run, shape, f"{why}: the last good shape is kept"
+        rebuilt, shape = covering is not shape, covering
         still, why = _same(run.theta, theta), ""
         run = run._replace(
             step=run.step + 1, theta=theta, state=state, values=values, since=run.since + 1
@@ -306,6 +315,7 @@ class _Loop(NamedTuple):
                 shape = _renewed(shape, theta, search)
             except ValueError as error:
                 renewed, why = False, f"neighbours could not be found anew: {error}"
+        if renewed or rebuilt:
             run = run._replace(lists=eqx.filter(shape, eqx.is_array))
         small = float(values.size) <= float(run.goal) * float(run.first)
         corrected = bool(self.equalities or self.inequalities) and (
@@ -313,8 +323,8 @@ class _Loop(NamedTuple):
         )
         if corrected:
             run = self.corrected(run)
-        if renewed or corrected:
-            run = _seen_again(self.problem(shape), run)
+        if renewed or rebuilt or corrected:
+            run = _seen_again(self.problem(shape), run, self.optimizer)
         elif still:
             why = why or "no step along the search lowers the objective"
         if int(run.stalls) >= _STALLS:
@@ -323,8 +333,19 @@ class _Loop(NamedTuple):
                 f"while the penalty grew to {float(run.multipliers.penalty):.3g}; they may "
                 "contradict each other, or what the shape can do"
             )
-        _note(run, refused=refused, renewed=renewed)
+        _note(run, refused=refused, renewed=renewed, rebuilt=rebuilt)
         return run, shape, why
+
+    def covered(self, shape, theta, values, multipliers, search):
+        """A shape whose points cover the surface at theta, what is seen of it, what is wrong."""
+        try:
+            covering = shape if search is None else _quietly(shape.rebuilt, theta, search)
+        except ValueError as error:
+            return shape, values, str(error)
+        if covering is not shape:
+            values = evaluated(self.problem(covering), theta, multipliers)[1]
+        code = int(values.code)
+        return covering, values, ILL[code] if code else ""
 
     def corrected(self, run: _Run) -> _Run:
         """With forces that the constraints were met with, and the penalty that this asks for."""
@@ -366,27 +387,35 @@ def _is_only_far(surface: Discretization) -> bool:
 
 
 def _renewed(shape: AbstractShape, theta, search: NeighborSearch) -> AbstractShape:
+    try:
+        return _quietly(shape.renewed, theta, search)
+    except ValueError:  # there may be no room
+        room = unchecked_surface(shape, theta).search(margin=2.0)
+        return _quietly(shape.renewed, theta, room)
+
+
+def _quietly(change: Callable, *args) -> AbstractShape:
+    """Without warnings: what bends within one stencil was told of the first surface."""
     with warnings.catch_warnings():
-        # What bends within one stencil was told of the first surface.
         warnings.simplefilter("ignore")
-        try:
-            return shape.renewed(theta, search)
-        except ValueError:  # there may be no room
-            room = unchecked_surface(shape, theta).search(margin=2.0)
-            return shape.renewed(theta, room)
+        return change(*args)
 
 
-def _seen_again(problem: Problem, run: _Run) -> _Run:
+def _seen_again(problem: Problem, run: _Run, optimizer) -> _Run:
     """After a change of what is minimised: value and gradient, also that which is remembered.
 
-    L-BFGS compares gradients at two places, which have to be those of one function.
+    L-BFGS compares gradients at two places, which have to be those of one function. It begins
+    again where that has none at the place before.
     """
     _, values = evaluated(problem, run.theta, run.multipliers)
     state = run.state
     head = state[0] if isinstance(state, tuple) and state else None
     if isinstance(head, optax.ScaleByLBFGSState):
         _, past = evaluated(problem, head.params, run.multipliers)
-        state = (head._replace(updates=past.gradient), *state[1:])
+        if int(past.code):
+            state = started(optimizer, run.theta)
+        else:
+            state = (head._replace(updates=past.gradient), *state[1:])
     return run._replace(values=values, state=state)
 
 

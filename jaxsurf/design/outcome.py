@@ -12,7 +12,9 @@ from ..discretization import Discretization
 from .shape import AbstractShape
 
 # What is told of every step.
-COLUMNS = ("objective", "gradient", "violation", "penalty", "refused", "renewed", "seconds")
+COLUMNS = (
+    "objective", "gradient", "violation", "penalty", "refused", "renewed", "rebuilt", "seconds",
+)  # fmt: skip
 
 
 class ShapeOptimization(eqx.Module):
@@ -26,7 +28,8 @@ class ShapeOptimization(eqx.Module):
         multipliers: derivatives of the objective in what the constraints ask for, less their sign.
         history: by names `(steps + 1,)`: `objective`, norm of the `gradient` of the Lagrangian,
             `violation`, `penalty`, how often a step was `refused`, whether neighbours were
-            `renewed`, `seconds`; every constraint by its own name, `(steps + 1, ...)`.
+            `renewed`, whether points were chosen anew (`rebuilt`), `seconds`; every constraint by
+            its own name, `(steps + 1, ...)`.
         converged: whether both tolerances were reached.
         stopped: why it ended.
 
@@ -56,7 +59,8 @@ class ShapeOptimization(eqx.Module):
 
     def __repr__(self):
         rows = self.history
-        counts = ", ".join(f"{int(rows[name].sum())} {name}" for name in ("refused", "renewed"))
+        told = ("refused", "renewed", "rebuilt")
+        counts = ", ".join(f"{int(rows[name].sum())} {name}" for name in told)
         constrained = self.equalities or self.inequalities
         about = f", violation {rows['violation'][-1]:.2g}" if constrained else ""
         return (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -9,9 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy import ndimage
 
-from jaxsurf.arguments import in_range, on_host, real, whole
+from jaxsurf.arguments import real, whole
 from jaxsurf.cloud import PointCloud
 from jaxsurf.compiling import block_by_block
 from jaxsurf.functions import Traced
@@ -19,7 +19,12 @@ from jaxsurf.shapes.implicit import Bounds, LevelSet, level_set_normals, program
 from jaxsurf.shapes.order import sort_points
 from jaxsurf.shapes.sampling import quasi_uniform
 from jaxsurf.shapes.spacing import MOST, points_at
+from jaxsurf.shapes.topology import Sides, checked_bounds
 
+# Cells along the longest side of a box.
+RESOLUTION = 48
+# Steps of relaxation, in the plane and in space.
+_RELAXED = {2: 200, 3: 40}
 # Newton steps along a ray at most, and how many widths of the band a candidate may stray.
 _STEPS, _STRAY = 30, 10
 
@@ -30,7 +35,7 @@ def level_set(
     bounds: Bounds,
     n: int | None = None,
     spacing: float | None = None,
-    resolution: int = 48,
+    resolution: int = RESOLUTION,
     steps: int | None = None,
     seed: int = 0,
 ) -> PointCloud:
@@ -67,7 +72,7 @@ def level_set(
         >>> bool(jnp.abs(cloud.normals - cloud.points).max() < 1e-12)
         True
     """
-    box = _checked_bounds(bounds)
+    box = checked_bounds(bounds)
     dim = box.shape[1]
     if (n is None) == (spacing is None):
         raise ValueError("give exactly one of n and spacing")
@@ -79,17 +84,49 @@ def level_set(
         real(spacing, "spacing", above=0)
     elif whole(n, "n", most=MOST) < 4:
         raise ValueError(f"n = {n} points, needs at least 4")
-    dtype = jnp.result_type(float)
-    program = program_of(phi, jax.ShapeDtypeStruct((dim,), dtype))
-    look = block_by_block(partial(_values_and_gradients, program), dtype)
-
-    cells, size = _crossed_cells(look, box, resolution)
+    look = watched(phi, dim)[1]
+    sides = Sides.of(lambda x: look(x)[0], box, resolution)
     if n is None:
-        measure = _candidates(look, cells, size, box, 50_000, seed)[2]
+        measure = _candidates(look, sides, 50_000, seed)[2]
         n = points_at(spacing, measure, dim=dim)  # type: ignore[arg-type]
         if n < 4:
             raise ValueError(f"spacing = {spacing} gives n = {n} points, needs at least 4")
-    candidates, normals, measure = _candidates(look, cells, size, box, max(6 * n, 5_000), seed)
+    return spread(phi, look, sides, n, steps=steps, seed=seed)
+
+
+def watched(phi: LevelSet, dim: int) -> tuple[Callable, Callable]:
+    """Values of phi, and values with gradients, of points on the host."""
+    dtype = jnp.result_type(float)
+    program = program_of(phi, jax.ShapeDtypeStruct((dim,), dtype))
+    compiled = lambda f: block_by_block(partial(f, program), dtype)
+    return compiled(_values), compiled(_values_and_gradients)
+
+
+def spread(
+    phi: LevelSet,
+    look: Callable,
+    sides: Sides,
+    n: int,
+    *,
+    on: Callable[[np.ndarray], np.ndarray] | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+) -> PointCloud:
+    """n points on a level set, or on those of its sheets that `on` says.
+
+    Args:
+        phi: the function.
+        look: its values and gradients, on the host.
+        sides: its signs on a grid.
+        on: which of some points are on sheets that get points; None for all.
+        steps, seed: as of `level_set`.
+    """
+    dim = len(sides.size)
+    candidates, normals, measure = _candidates(look, sides, max(6 * n, 5_000), seed)
+    if on is not None:
+        kept = on(candidates)
+        candidates, normals = candidates[kept], normals[kept]
+        measure *= kept.mean()
     if len(candidates) < n:
         raise ValueError(f"only {len(candidates)} candidates for n = {n} points: finer resolution?")
     # Between steps of relaxation points need not be closer to the surface than this.
@@ -100,7 +137,7 @@ def level_set(
         lambda x: _onto(look, x, rough),
         measure=measure,
         normals=normals,
-        steps=steps if steps is not None else (40 if dim == 3 else 200),
+        steps=steps if steps is not None else _RELAXED[dim],
         seed=seed,
     )
     points = _onto(look, points)[0]
@@ -155,6 +192,11 @@ def double_torus(thickness: float | Float[Array, ""] = 0.4) -> tuple[LevelSet, B
 
 
 @eqx.filter_jit
+def _values(phi: Traced, points):
+    return jax.vmap(phi)(points)
+
+
+@eqx.filter_jit
 def _values_and_gradients(phi: Traced, points):
     return jax.vmap(jax.value_and_grad(phi))(points)
 
@@ -193,69 +235,10 @@ def _onto(look, start: np.ndarray, limit: float | None = None, *, most: float = 
     return found, normals
 
 
-def _checked_bounds(bounds) -> np.ndarray:
-    box = on_host(bounds, "bounds", (2, 2), (2, 3))
-    if not (np.isfinite(box).all() and (box[1] > box[0]).all()):
-        raise ValueError(f"upper corner {box[1]} must exceed lower corner {box[0]} on every axis")
-    return in_range(box, "bounds")
-
-
-def _crossed_cells(look, box: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Lower corners of the grid cells in and next to which phi changes sign, and their size."""
-    side = box[1] - box[0]
-    counts = np.maximum(np.ceil(resolution * side / side.max() - 1e-9).astype(int), 4)
-    size = side / counts
-    axes = [box[0, a] + size[a] * np.arange(counts[a] + 1) for a in range(len(side))]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    phi = look(nodes.reshape(-1, len(side)))[0].reshape(counts + 1)
-    inside, unknown = _signs(phi, nodes)
-    if inside.all() or not inside.any():
-        raise ValueError(
-            f"phi has no zero within the bounds: it goes from {np.nanmin(phi):.3g} to "
-            f"{np.nanmax(phi):.3g} on a grid of {' x '.join(map(str, counts))} cells{unknown}"
-        )
-    for axis in range(len(side)):
-        for end, name in ((0, "lower"), (-1, "upper")):
-            face = np.take(inside, end, axis=axis)
-            if face.any() and not face.all():
-                raise ValueError(
-                    f"the level set leaves the bounds through the {name} side of axis {axis}: "
-                    f"give larger bounds (only closed level sets can be sampled){unknown}"
-                )
-    crossed = ndimage.minimum_filter(inside, size=2) != ndimage.maximum_filter(inside, size=2)
-    crossed = crossed[(slice(1, None),) * len(side)]
-    crossed = ndimage.binary_dilation(crossed, np.ones((3,) * len(side)))
-    return box[0] + size * np.argwhere(crossed), size
-
-
-def _signs(phi: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, str]:
-    """Where phi < 0, and a note on nodes where it is no number.
-
-    Such nodes, like the centre of a star shape, are on the side that all nodes around them are on.
-    """
-    inside, lost = phi < 0, np.isnan(phi)
-    if not lost.any():
-        return inside, ""
-    if lost.all():
-        raise ValueError("phi is not a number anywhere within the bounds")
-    around = np.ones((3,) * phi.ndim)
-    label, _ = ndimage.label(lost, around)
-    for part, box in enumerate(ndimage.find_objects(label), 1):
-        wide = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in box)
-        here = label[wide] == part
-        rim = ndimage.binary_dilation(here, around) & ~lost[wide]
-        sides = inside[wide][rim]
-        if sides.any() and not sides.all():
-            place = nodes[wide][here][0]
-            raise ValueError(f"phi is not a number at {place}, next to where it changes sign")
-        inside[wide][here] = sides.any()
-    first = nodes[lost][0]
-    return inside, f" (phi is not a number at {first} and {lost.sum() - 1} other nodes)"
-
-
-def _candidates(look, cells, size, box, m: int, seed: int):
+def _candidates(look, sides: Sides, m: int, seed: int):
     """At least about m points spread evenly over the surface, their normals, and its area."""
     rng = np.random.default_rng(seed)
+    cells, size, box = sides.crossed_cells(), sides.size, sides.box
     dim = len(size)
     # Uniform in the band |distance| <= width means uniform over the surface, up to (width x
     # curvature)²; the dilated cells hold that band. About a sixth of each cell layer is in it.

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..arguments import count_on, instance, precision_of, real, switched_off, whole
 from ..boundary import Closure, check_border
-from ..failures import is_concrete
+from ..failures import is_concrete, is_marking
 from ..stencils.algebra import AbstractOperator, check_scalar
 from . import invariant
 from .invariant import Subspace
@@ -289,17 +289,34 @@ def _sylvester(system: _System, space: Subspace, rhs: Float[Array, "n K"]) -> Fl
 
 
 def _on_host(function, shapes, *arguments):
-    """Call a function of NumPy arrays: at once if their values are known, else when they are."""
+    """Call a function of NumPy arrays: at once if their values are known, else when they are.
+
+    Where bad results are to be marked (`marking`) all is NaN instead of an error.
+    """
     arrays, static = eqx.partition(arguments, eqx.is_array)
+    marked = is_marking() and not is_concrete(arrays)
 
     def call(arrays):
         arrays = jax.tree.map(np.asarray, arrays)
-        return function(*eqx.combine(arrays, static))
+        try:
+            if marked and not all(np.isfinite(a).all() for a in jax.tree.leaves(arrays)):
+                raise ValueError("arrays are not finite")
+            return function(*eqx.combine(arrays, static))
+        except (ValueError, RuntimeError):
+            if not marked:
+                raise
+            return jax.tree.map(_nothing, shapes)
 
     if is_concrete(arrays):
         found = call(arrays)
         return jax.tree.map(lambda a, shape: jnp.asarray(a, shape.dtype), found, shapes)
     return jax.pure_callback(call, shapes, arrays, vmap_method="sequential")
+
+
+def _nothing(shape: jax.ShapeDtypeStruct) -> np.ndarray:
+    """NaN, or where there is none for numbers of that kind, 0."""
+    inexact = jnp.issubdtype(shape.dtype, jnp.inexact)
+    return np.full(shape.shape, np.nan if inexact else 0, shape.dtype)
 
 
 def _spread(tree, free, n: int, dtype):

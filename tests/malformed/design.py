@@ -54,6 +54,14 @@ def optimized(f=reach, theta=1.0, optimizer=optax.sgd(0.1), **options):
     return lambda: js.optimize_shape(f, shape(), theta, optimizer=optimizer, **options)
 
 
+BOX = ((-1.3,) * 3, (1.3,) * 3)
+
+
+def boxed(level, bounds):
+    shape = lambda: js.LevelSetShape(lambda x, a: x @ x - a, surface(), bounds)
+    return lambda: js.optimize_shape(reach, shape(), level, optimizer=optax.sgd(0.1))
+
+
 CALLS = [
     ("optimize_shape", "a number for the objective", optimized(f=1.0), ("objective is a float", "function")),
     ("optimize_shape", "an objective with several values", optimized(f=lambda s: s.cloud.points[0]), ("objective", "(3,)", "one number")),
@@ -113,6 +121,14 @@ CALLS = [
     ("LevelSetShape", "a number for phi", lambda: js.LevelSetShape(1.0, surface()), ("phi is a float", "function")),
     ("LevelSetShape", "a cloud", lambda: js.LevelSetShape(lambda x, a: x @ x - a, surface().cloud), ("surface", "Discretization")),
     ("LevelSetShape", "an empty level set", lambda: level_set()(1.0), ("point 0", "did not converge")),
+    *(("LevelSetShape", label, lambda bounds=bounds: js.LevelSetShape(lambda x, a: x @ x - a, surface(), bounds), words) for label, bounds, words in (
+        ("bounds in the plane", ((-1.5, -1.5), (1.5, 1.5)), ("bounds of shape (2, 2)", "3 axes")),
+        ("bounds the wrong way round", ((1.5,) * 3, (-1.5,) * 3), ("upper corner", "lower corner")),
+        ("one number for bounds", 1.5, ("bounds", "()")),
+    )),
+    ("LevelSetShape", "bounds for a border", lambda: js.LevelSetShape(lambda x, a: x @ x - a, cap(), BOX), ("bounds", "without boundary")),
+    ("optimize_shape", "a level set that leaves its bounds", boxed(2.0, BOX), ("the level set leaves the bounds",)),
+    ("optimize_shape", "an empty level set in bounds", boxed(-1.0, BOX), ("phi has no zero within the bounds",)),
     ("LevelSetShape", "phi with several values", lambda: js.LevelSetShape(lambda x, a: a * x, surface())(1.0), ("phi must return a scalar", "(3,)")),
     ("MappedShape", "a matrix for f", lambda: js.MappedShape(jnp.eye(3), surface()), ("f is a", "function")),
     ("MappedShape", "a cloud", lambda: js.MappedShape(lambda x, a: a * x, surface().cloud), ("base", "Discretization or Shape")),

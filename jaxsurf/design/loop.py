@@ -1,0 +1,322 @@
+r"""The loop of an optimisation: steps that may be refused, lists and points that are renewed."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import PyTree
+
+from ..discretization import Discretization
+from ..renew import NeighborSearch
+from ..time.checkpoint import Checkpoint, digest, read_back, written
+from .asked import FAR, ILL, refuse_start
+from .lagrangian import Multipliers, Problem, Values, direction, evaluated, kinds, started
+from .outcome import COLUMNS, ShapeOptimization
+from .shape import AbstractShape, unchecked_surface, with_wear
+
+# A step that fails is halved so often.
+_HALVINGS = 12
+# Forces are corrected after so many steps, or when the gradient has fallen to a share of its first.
+_INNER, _GOAL = 20, 0.1
+# A violation that does not fall to this share makes the penalty grow by that factor; one that
+# stays above the last share so many times in a row cannot be mended.
+_FALLS, _GROWTH, _STAYS, _STALLS = 0.25, 4.0, 0.9, 8
+
+
+class _Run(NamedTuple):
+    """All that a step begins with, as arrays: what is on disk.
+
+    Args:
+        step: how many were made.
+        theta, state: parameters, and what the optimiser remembers.
+        multipliers, values: forces, and what is seen at theta.
+        lists: the arrays of the shape.
+        first: norm of the first gradient.
+        goal: share of it at which the forces are corrected.
+        since: steps since they were.
+        violation: what it was then.
+        stalls: how often in a row it has stayed.
+        history: one row a step, NaN where there was none.
+    """
+
+    step: Any
+    theta: PyTree
+    state: PyTree
+    multipliers: Multipliers
+    values: Values
+    lists: PyTree
+    first: Any
+    goal: Any
+    since: Any
+    violation: Any
+    stalls: Any
+    history: dict[str, np.ndarray]
+
+
+class _Held:
+    """A shape whose arrays are constants of the programs."""
+
+    def __init__(self, shape: AbstractShape):
+        self.shape = shape
+
+    def __call__(self, theta):
+        return self.shape(theta)
+
+    def __hash__(self):
+        return id(self.shape)
+
+    def __eq__(self, other):
+        return isinstance(other, _Held) and self.shape is other.shape
+
+
+class _File(NamedTuple):
+    """Where a run is written, after how many steps, and what it is known by."""
+
+    path: Path
+    every: int
+    told: str
+
+    def read(self, run: _Run) -> _Run:
+        """As far as it has come, if it is there."""
+        if not self.path.exists():
+            return run
+        found = read_back(self.path, self.told, run)
+        place = lambda new, old: jnp.asarray(new) if isinstance(old, jax.Array) else new
+        return jax.tree.map(place, found, run)
+
+
+class Loop(NamedTuple):
+    """What does not change during a run."""
+
+    objective: Callable
+    equalities: dict[str, Callable]
+    inequalities: dict[str, Callable]
+    project: Callable | None
+    args: tuple
+    optimizer: Any
+    numbers: dict[str, Any]
+    callback: Callable | None
+    checkpoint: Checkpoint | None
+
+    def run(self, shape: AbstractShape, theta) -> tuple[ShapeOptimization, bool]:
+        """What is found, and whether it failed."""
+        clock, renew = time.perf_counter(), self.numbers["renew"]
+        shape = shape.rebuilt(theta) if renew else shape
+        try:
+            surface = shape(theta)
+        except ValueError:
+            surface = unchecked_surface(shape, theta)
+            if not (renew and _is_only_far(surface)):
+                raise
+            shape = shape.renewed(theta, surface.search())
+        search = surface.search() if renew else None
+        shape = with_wear(shape) if renew else shape
+        problem = self.problem(shape)
+        run = self.first(problem, shape, theta)
+        file = None
+        if self.checkpoint is not None:
+            told = digest((self._replace(callback=None, checkpoint=None), shape, theta))
+            file = _File(Path(self.checkpoint.path), max(1, round(self.checkpoint.every)), told)
+            run = file.read(run)
+            shape = eqx.combine(run.lists, shape)
+        clock -= float(run.history["seconds"][int(run.step)])
+        stopped, failed = self.ended(run), False
+        while not stopped:
+            run, shape, stopped = self.step(self.problem(shape), shape, run, search)
+            run.history["seconds"][int(run.step)] = time.perf_counter() - clock
+            failed = bool(stopped)
+            if failed:
+                break
+            stopped = self.ended(run)
+            if file is not None and (stopped or int(run.step) % file.every == 0):
+                written(file.path, file.told, run)
+            if self.callback is not None and self.callback(self.found(run, shape, stopped)):
+                stopped = stopped or "ended by the callback"
+        return self.found(run, shape, stopped), failed
+
+    def problem(self, shape) -> Problem:
+        held = shape if self.numbers["renew"] else _Held(shape)
+        return Problem(held, *self[:3], self.args, self.project)
+
+    def first(self, problem, shape, theta) -> _Run:
+        """At the start, if it is good."""
+        f, h, g = kinds(problem, theta)
+        if f.shape != ():
+            raise ValueError(f"objective returns shape {f.shape}, expected one number")
+        nothing = lambda some: {name: jnp.zeros(x.shape, x.dtype) for name, x in some.items()}
+        given = self.numbers["penalty"]
+        mu = jnp.asarray(10 if given is None else given, f.dtype)
+        multipliers = Multipliers(nothing(h), nothing(g), mu)
+        theta, values = evaluated(problem, theta, multipliers)
+        refuse_start(values)
+        if given is None and (h or g):
+            mu = 10 * jnp.maximum(1, jnp.abs(values.objective))
+            multipliers = multipliers._replace(penalty=mu)
+            theta, values = evaluated(problem, theta, multipliers)
+        rows = self.numbers["steps"] + 1
+        history = {name: np.full(rows, np.nan) for name in COLUMNS}
+        for name, x in (values.equalities | values.inequalities).items():
+            history[name] = np.full((rows, *x.shape), np.nan)
+        zero = np.array(0)
+        run = _Run(
+            zero, theta, started(self.optimizer, theta), multipliers, values,
+            eqx.filter(shape, eqx.is_array), values.size, np.array(_GOAL), zero,
+            np.array(np.inf), zero, history,
+        )  # fmt: skip
+        _note(run, refused=0, renewed=0, rebuilt=0)
+        history["seconds"][0] = 0.0
+        return run
+
+    def step(self, problem, shape, run: _Run, search) -> tuple[_Run, AbstractShape, str]:
+        """One step, what it asks for, and why there is none."""
+
+        def look(theta, *updates):
+            theta, values = evaluated(problem, theta, run.multipliers, *updates)
+            return self.covered(shape, theta, values, run.multipliers, search), theta
+
+        # A search along a line goes on to where there are other parts.
+        beyond = lambda theta: look(theta)[0][1]
+        updates, state = direction(self.optimizer, beyond, run.theta, run.values, run.state)
+        for refused in range(_HALVINGS + 1):
+            (covering, values, ill), theta = look(run.theta, updates, 0.5**refused)
+            if not ill:
+                break
+        else:
+            why = f"steps were halved {_HALVINGS} times, and still {ill}"
+            return run, shape, f"{why}: the last good shape is kept"
+        rebuilt, shape = covering is not shape, covering
+        still, why = _same(run.theta, theta), ""
+        run = run._replace(
+            step=run.step + 1, theta=theta, state=state, values=values, since=run.since + 1
+        )
+        renewed = bool(values.worn) and search is not None
+        if renewed:
+            try:
+                shape = _renewed(shape, theta, search)
+            except ValueError as error:
+                renewed, why = False, f"neighbours could not be found anew: {error}"
+        if renewed or rebuilt:
+            run = run._replace(lists=eqx.filter(shape, eqx.is_array))
+        small = float(values.size) <= float(run.goal) * float(run.first)
+        corrected = bool(self.equalities or self.inequalities) and (
+            still or small or int(run.since) >= _INNER
+        )
+        if corrected:
+            run = self.corrected(run)
+        if renewed or rebuilt or corrected:
+            run = _seen_again(self.problem(shape), run, self.optimizer)
+        elif still:
+            why = why or "no step along the search lowers the objective"
+        if int(run.stalls) >= _STALLS:
+            why = (
+                f"constraints are not met: a violation of {float(run.violation):.3g} has stayed "
+                f"while the penalty grew to {float(run.multipliers.penalty):.3g}; they may "
+                "contradict each other, or what the shape can do"
+            )
+        _note(run, refused=refused, renewed=renewed, rebuilt=rebuilt)
+        return run, shape, why
+
+    def covered(self, shape, theta, values, multipliers, search):
+        """A shape whose points cover the surface at theta, what is seen of it, what is wrong."""
+        try:
+            covering = shape if search is None else _quietly(shape.rebuilt, theta, search)
+        except ValueError as error:
+            return shape, values, str(error)
+        if covering is not shape:
+            values = evaluated(self.problem(covering), theta, multipliers)[1]
+        code = int(values.code)
+        return covering, values, ILL[code] if code else ""
+
+    def corrected(self, run: _Run) -> _Run:
+        """With forces that the constraints were met with, and the penalty that this asks for."""
+        now, last = float(run.values.violation), float(run.violation)
+        multipliers = run.values.forced
+        wrong = now > self.numbers["ctol"]
+        if wrong and now > _FALLS * last:
+            multipliers = multipliers._replace(penalty=_GROWTH * multipliers.penalty)
+        stalls = run.stalls + 1 if wrong and now > _STAYS * last else np.array(0)
+        goal = np.maximum(self.numbers["rtol"], _GOAL * run.goal)
+        return run._replace(
+            multipliers=multipliers, violation=np.array(now), stalls=stalls, goal=goal,
+            since=np.array(0),
+        )  # fmt: skip
+
+    def ended(self, run: _Run) -> str:
+        """Why it ends here, if it does."""
+        small = float(run.values.size) <= self.numbers["rtol"] * float(run.first)
+        if small and float(run.values.violation) <= self.numbers["ctol"]:
+            return "converged"
+        steps = self.numbers["steps"]
+        return f"all {steps} steps used" if int(run.step) >= steps else ""
+
+    def found(self, run: _Run, shape, stopped: str) -> ShapeOptimization:
+        rows = {name: values[: int(run.step) + 1].copy() for name, values in run.history.items()}
+        v, forces = run.values, run.multipliers.equalities | run.multipliers.inequalities
+        return ShapeOptimization(
+            run.theta, shape, v.objective, v.equalities, v.inequalities, forces, rows,
+            stopped == "converged", stopped or "under way",
+        )  # fmt: skip
+
+
+def _is_only_far(surface: Discretization) -> bool:
+    """Whether nothing is wrong with a surface but its lists."""
+    try:
+        return set(np.asarray(surface.code).tolist()) <= {0, FAR}
+    except ValueError:  # it has no operators
+        return False
+
+
+def _renewed(shape: AbstractShape, theta, search: NeighborSearch) -> AbstractShape:
+    try:
+        return _quietly(shape.renewed, theta, search)
+    except ValueError:  # there may be no room
+        room = unchecked_surface(shape, theta).search(margin=2.0)
+        return _quietly(shape.renewed, theta, room)
+
+
+def _quietly(change: Callable, *args) -> AbstractShape:
+    """Without warnings: what bends within one stencil was told of the first surface."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return change(*args)
+
+
+def _seen_again(problem: Problem, run: _Run, optimizer) -> _Run:
+    """After a change of what is minimised: value and gradient, also that which is remembered.
+
+    L-BFGS compares gradients at two places, which have to be those of one function. It begins
+    again where that has none at the place before.
+    """
+    _, values = evaluated(problem, run.theta, run.multipliers)
+    state = run.state
+    head = state[0] if isinstance(state, tuple) and state else None
+    if isinstance(head, optax.ScaleByLBFGSState):
+        _, past = evaluated(problem, head.params, run.multipliers)
+        if int(past.code):
+            state = started(optimizer, run.theta)
+        else:
+            state = (head._replace(updates=past.gradient), *state[1:])
+    return run._replace(values=values, state=state)
+
+
+def _note(run: _Run, **others) -> None:
+    """The row of a step."""
+    v, row = run.values, int(run.step)
+    known = dict(objective=v.objective, gradient=v.size, violation=v.violation)
+    known |= dict(penalty=run.multipliers.penalty) | others | v.equalities | v.inequalities
+    for name, value in known.items():
+        run.history[name][row] = np.asarray(value)
+
+
+def _same(a: PyTree, b: PyTree) -> bool:
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b))
+    return all(bool(np.array_equal(x, y)) for x, y in pairs)

@@ -79,30 +79,35 @@ def _picture(path: Path, start, found: js.ShapeOptimization, excess) -> None:
     plt.close(figure)
 
 
-def run(quick: bool, out: Path) -> list[Row]:
-    n = 600 if quick else 2_000
+def minimised(n: int) -> tuple[js.MappedShape, js.ShapeOptimization, list]:
+    """The family, what was found, and the parameters on the way there."""
     star = js.star_shape(js.discretize(js.sphere(n), method=_METHOD), _DEGREE)
-    theta = jnp.asarray(bumpy())
-    way = [theta]
+    way = [jnp.asarray(bumpy())]
     found = js.optimize_shape(
         area,
         star,
-        theta,
+        way[0],
         optimizer=optax.lbfgs(),
         equalities={"volume": excess_volume},
         rtol=1e-5,
         callback=lambda now: way.append(now.theta),
     )
+    return star, found, way
+
+
+def run(quick: bool, out: Path) -> list[Row]:
+    n = 600 if quick else 2_000
+    star, found, way = minimised(n)
     print(found)
     least = lambda volume: (36 * np.pi * volume**2) ** (1 / 3)
     measured = np.array([exact(theta) for theta in way])
     excess, volume = measured[:, 0] / least(measured[:, 1]) - 1, measured[-1, 1]
     rows = found.history
     # The lists of the sphere do not reach on it: made anew, for the picture.
-    start = jax.jit(lambda theta: (star(theta).cloud.points, star(theta).cloud.normals))(theta)
+    start = jax.jit(lambda theta: (star(theta).cloud.points, star(theta).cloud.normals))(way[0])
     start = js.discretize(js.PointCloud(*start), method=_METHOD)
     _picture(out / "isoperimetric.png", start, found, excess)
-    about = {"n": n, "method": "GFDM(degree=2)", "parameters": len(theta)}
+    about = {"n": n, "method": "GFDM(degree=2)", "parameters": len(way[0])}
     seconds = np.diff(rows["seconds"])
     steps = np.flatnonzero(np.cumsum(rows["renewed"])[1:] > 0)  # all is compiled
     return [

@@ -16,7 +16,7 @@ _NEEDED = f"needs {', '.join(_MISSING)}: pip install 'jaxsurf[notebooks]'"
 
 @pytest.mark.core
 def test_there_are_notebooks():
-    names = ["inverse_problems", "moving_surfaces", "patterns", "quickstart"]
+    names = ["inverse_problems", "moving_surfaces", "patterns", "quickstart", "shape_optimisation"]
     assert [path.stem for path in _NOTEBOOKS] == names
 
 

@@ -23,6 +23,7 @@ from .build import stencil_weights
 from .cells import all_on, distance_key
 from .checks import DETOUR, LINK, RINGS, ring_size
 from .cloud import PointCloud
+from .compiling import sized_jit
 from .failures import unchecked
 from .nearest import Grid, Nearest, nearest_in
 from .neighbors import Neighbors, Rows
@@ -128,7 +129,7 @@ def _candidates(grid, reach):
     return jax.lax.map(lambda i: grid.candidates(i[None], reach, 1)[1][0], rows, batch_size=1024)
 
 
-@eqx.filter_jit
+@sized_jit
 def renewed(
     search: NeighborSearch, cloud: PointCloud, before: Neighbors, operators: Callable
 ) -> tuple[Neighbors, Int[Array, " n"], tuple]:

@@ -5,6 +5,7 @@ is the temperature of that point at time T. No surface of area A cools below 1 /
 kernel, $K(T, x, x) = \sum_k e^{-\lambda_k T} \phi_k(x)^2 > 1 / A$; that of the sphere is a series
 of Legendre polynomials. Short times see Gauss's curvature, $4 \pi t\,K(t, x, x) = 1 + t\,G(x) / 3$:
 cooling is quick at a saddle, which without a bound of the bending would become ever sharper.
+(The spot is that of a kernel of the plane, of a short time: the bound is nearly one of its heat.)
 """
 
 from __future__ import annotations
@@ -65,16 +66,16 @@ def excess_bending(surface: js.Discretization):
     return surface.integrate(surface.mean_curvature**2) / _AREA - _BENDING
 
 
-def ball(n: int, method=_METHOD) -> js.Discretization:
+def ball(n: int) -> js.Discretization:
     """The unit sphere, its first point at the top."""
     points = js.sphere(n).points
     turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], np.asarray(points[:1]))
     points = points @ turn.as_matrix().T
-    return js.discretize(js.PointCloud(points, points), method=method)
+    return js.discretize(js.PointCloud(points, points), method=_METHOD)
 
 
 def bumpy() -> Float[Array, " m"]:
-    """Coefficients of the radius. Those of the sphere are a saddle: stars of revolution stay so."""
+    """Coefficients of the radius. A search from the sphere stays among surfaces of revolution."""
     theta = 0.05 * np.random.default_rng(0).normal(size=(_DEGREE + 1) ** 2)
     theta[:4] = [np.sqrt(4 * np.pi), 0, 0, 0]
     return jnp.asarray(theta)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -27,7 +28,7 @@ class LivePlot:
         field: what the surface is coloured by, a function of it, `lambda surface:
             surface.mean_curvature`; None shows the shape alone.
         every: steps from one picture to the next.
-        label, view, pixels: as in `plot_cloud`.
+        label, limits, view, pixels: as in `plot_cloud`.
 
     Raises:
         TypeError: a field that is no function; a number of steps that is none; what is drawn is no
@@ -53,6 +54,7 @@ class LivePlot:
         *,
         every: int = 1,
         label: str | None = None,
+        limits: tuple[float, float] | None = None,
         view: tuple[float, float, float] = (1.0, -1.7, 0.9),
         pixels: int = 400,
     ):
@@ -71,7 +73,10 @@ class LivePlot:
         steps = len(found.history["seconds"]) - 1
         if steps % self.every and found.stopped == "under way":
             return
-        self._draw(found, steps)
+        with warnings.catch_warnings():
+            # What bends within one stencil was told of the first surface.
+            warnings.simplefilter("ignore")
+            self._draw(found, steps)
         self._show()
 
     def _draw(self, found: ShapeOptimization, steps: int) -> None:

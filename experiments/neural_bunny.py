@@ -39,6 +39,9 @@ _STEP = 1e-3
 # Units of the objective: of distances, over the diagonal of the data's box, and of eigenvalues.
 _FAR, _OFF = 5e-3, 3e-3
 _METHOD = js.GFDM(degree=2)
+# Least cosine between normals of neighbours: those across the rim of an ear are none, which would
+# point to the other side after the first small step.
+_COSINE = 0.2
 
 
 def network() -> eqx.nn.MLP:
@@ -151,20 +154,23 @@ class Bunny:
         some = np.random.default_rng(0).choice(len(self.points), _TARGETS, replace=False)
         self.given = (*(jnp.asarray(a[some]) for a in (self.points, self.normals)), self.scale)
 
-    def sampled(self, theta, n: int, method=_METHOD) -> js.Discretization:
+    def sampled(self, theta, n: int) -> js.Discretization:
         cloud = js.level_set(lambda x: self.phi(x, theta), n=n, bounds=self.bounds)
-        return js.discretize(cloud, method=method)
+        k = _METHOD.neighbor_count(3)
+        lists = js.find_neighbors(cloud, k, min_cosine=_COSINE, throw=False)
+        return js.discretize(cloud, lists, method=_METHOD)
 
     def shape(self, theta, n: int) -> js.LevelSetShape:
         return js.LevelSetShape(self.phi, self.sampled(theta, n), self.bounds)
 
     def distance(self, theta) -> float:
-        """Root mean square of all points of the scan to the level set, over their box's diagonal.
+        r"""Root mean square of all points of the scan to the level set, over their box's diagonal.
 
-        Of each along the gradient of phi: a little more than the shortest.
+        To first order in the distance: $|\phi| / |\nabla \phi|$.
         """
-        on = js.project_to_level_set(lambda x: self.phi(x, theta), jnp.asarray(self.points))
-        return float(jnp.sqrt(jnp.mean(jnp.sum((on - self.points) ** 2, axis=1)))) / self.scale
+        seen = jax.vmap(jax.value_and_grad(lambda x: self.phi(x, theta)))
+        value, slope = seen(jnp.asarray(self.points))
+        return float(jnp.sqrt(jnp.mean(value**2 / jnp.sum(slope**2, axis=1)))) / self.scale
 
 
 def problem(n: int):
@@ -206,6 +212,13 @@ def run(quick: bool, out: Path) -> list[Row]:
 
         def seen(now, asked=asked):
             errors.append(np.asarray(values(now.surface) / asked - 1))
+            print(
+                len(errors),
+                float(now.objective),
+                np.round(errors[-1], 4),
+                round(time.perf_counter() - clock),
+                flush=True,
+            )
 
         found = js.optimize_shape(
             mismatch, shape, theta, optimizer=optax.lbfgs(), args=(*bunny.given, asked),

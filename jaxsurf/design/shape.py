@@ -9,31 +9,17 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ..arguments import as_float, differentiable, instance, switched_off
-from ..cloud import PointCloud
 from ..compiling import sized_jit
 from ..discretization import Discretization
-from ..failures import check, marking, not_positive, unchecked
+from ..failures import check, marking, not_positive
 from ..frames import frames_of
 from ..functions import Traced, canonical
 from ..motion import crossed
-from ..neighbors import Neighbors, find_neighbors
 from ..normals import refit_normals
 from ..renew import NeighborSearch
-from ..shapes.implicit import Bounds, level_set_normals, project_to_level_set
-from ..shapes.level_sets import RESOLUTION, spread, watched
-from ..shapes.sampling import relax
-from ..shapes.spacing import ideal_spacing
-from ..shapes.topology import Sides, checked_bounds
-
-# Steps of repulsion by which points are spread again over a level set.
-_SPREAD = 10
-# A sheet gets points if they fill so many stencils; with fewer than wanted by this factor it is
-# sampled anew.
-_STENCILS, _FEWER = 2, 4
 
 
 class AbstractShape(eqx.Module):
@@ -78,8 +64,8 @@ class AbstractShape(eqx.Module):
             ValueError: as `surface.moved`.
         """
         surface = unchecked_surface(self, theta)
-        found = surface.moved(*_geometry(surface), search=search)
-        return _followed(self, lambda x: _with_lists(x, found))
+        found = surface.moved(*geometry(surface), search=search)
+        return _followed(self, lambda x: with_lists(x, found))
 
     def rebuilt(self, theta: PyTree, search: NeighborSearch | None = None) -> AbstractShape:
         r"""The same family, on other points where those there are do not cover its surface at
@@ -96,123 +82,6 @@ class AbstractShape(eqx.Module):
             ValueError: there is no surface at theta, or none that can be sampled.
         """
         return self
-
-
-class LevelSetShape(AbstractShape):
-    r"""The level sets $\{x : \phi(x, \theta) = 0\}$, of neural networks too.
-
-    Points are those of the reference moved along $\nabla\phi$ onto the level set; their
-    derivatives in $\theta$ follow by the implicit function theorem. Normals are exact.
-
-    With `bounds` their topology may change in `js.optimize_shape`. After each step the signs of
-    phi on a grid over the box tell which sheets the level set has. Where one was born, vanished,
-    met another or parted, a hole opened or closed, or one has less than a quarter of the points
-    that its area asks for, the level set is sampled anew, with as many points in all. What would
-    get fewer points than two stencils hold is not seen, nor what is thinner than a cell, a 48th of
-    the box. Derivatives are those of the sheets that have points: none tells that another would be
-    born, and functions of the surface jump where it is.
-
-    Args:
-        phi: function of one point `(d,)` and of parameters, any pytree (an `eqx.nn.MLP`, say,
-            under `eqx.filter_grad` and `eqx.filter_jit`).
-        surface: of a level set nearby, as of `js.level_set(lambda x: phi(x, theta0), ...)`.
-        bounds: lower and upper corner of a box that the level set stays in, as of `js.level_set`;
-            None where its topology does not change.
-
-    Differentiable: forward and reverse in theta, for fixed neighbours.
-    Raises:
-        TypeError: phi that is no function, a surface that is no discretisation.
-        ValueError: at a theta for which points do not reach the level set, named by point; under
-            `jit`, `vmap` and `grad` they are NaN, with code 1. Bounds of another dimension or that
-            are none, or for a surface with a border, a mask or a spacing of its own.
-
-    Example:
-        >>> phi = lambda x, axes: jnp.sum((x / axes) ** 2) - 1
-        >>> axes = jnp.array([1.0, 0.8, 0.7])
-        >>> surface = js.discretize(js.ellipsoid(300, axes), method=js.GFDM(degree=2))
-        >>> shape = js.LevelSetShape(phi, surface)
-        >>> height = lambda axes: shape(axes).cloud.points[:, 2].max()
-        >>> bool(jax.grad(height)(axes)[2] > 0.9)
-        True
-    """
-
-    phi: Callable[[Float[Array, " d"], PyTree], Float[Array, ""]]
-    surface: Discretization
-    bounds: Float[Array, "2 d"] | None
-    # How many sheets had points when they were chosen, and how many tunnels; 0 if not yet known.
-    topology: Int[Array, "2"] | None
-
-    def __init__(
-        self,
-        phi: Callable[[Float[Array, " d"], PyTree], Float[Array, ""]],
-        surface: Discretization,
-        bounds: Bounds | None = None,
-    ):
-        _function(phi, "phi")
-        _surface(surface)
-        self.phi, self.surface, self.bounds, self.topology = phi, surface, None, None
-        if bounds is not None:
-            cloud = surface.cloud
-            for name in ("boundary", "active", "spacing"):
-                if getattr(cloud, name) is not None:
-                    raise ValueError(f"bounds are for surfaces without {name}: this one has some")
-            box = checked_bounds(bounds)
-            if box.shape[1] != cloud.dim:
-                raise ValueError(f"bounds of shape {box.shape} for a surface in {cloud.dim} axes")
-            self.bounds, self.topology = jnp.asarray(box), jnp.zeros(2, jnp.int32)
-
-    def __call__(self, theta: PyTree) -> Discretization:
-        phi = lambda x: self.phi(x, theta)
-        cloud = self.surface.cloud
-        # A switched-off point goes where another goes, and stays where it is.
-        start = cloud.points
-        if cloud.active is not None:
-            start = switched_off(cloud.active, start, start[jnp.argmax(cloud.active)])
-        points = project_to_level_set(phi, start)
-        return self.surface.moved(points, level_set_normals(phi, points))
-
-    def renewed(self, theta: PyTree, search: NeighborSearch) -> LevelSetShape:
-        """As of any shape; without border or mask, points are also spread evenly again."""
-        surface = unchecked_surface(self, theta)
-        cloud = surface.cloud
-        if cloud.active is None and cloud.boundary is None:
-            phi = lambda x: self.phi(x, theta)
-
-            def onto(x):
-                x = project_to_level_set(phi, jnp.asarray(x, cloud.points.dtype), throw=False)
-                return x, level_set_normals(phi, x)
-
-            spacing = ideal_spacing(float(jnp.sum(surface.areas)), cloud.n, dim=cloud.dim)
-            even = relax(np.asarray(cloud.points), onto, spacing=spacing, steps=_SPREAD)
-            points, normals = (jnp.asarray(a, cloud.points.dtype) for a in even)
-        else:
-            points, normals = _geometry(surface)
-        found = surface.moved(points, normals, search=search)
-        return eqx.tree_at(lambda s: s.surface, self, _with_lists(found, found))
-
-    def rebuilt(self, theta: PyTree, search: NeighborSearch | None = None) -> LevelSetShape:
-        """Another sample, within the bounds, where the points are not one of the level set."""
-        if self.bounds is None:
-            return self
-        phi, cloud = lambda x: self.phi(x, theta), self.surface.cloud
-        values, look = watched(phi, cloud.dim)
-        sides = Sides.of(values, np.asarray(self.bounds, float), RESOLUTION)
-        sheets = sides.sheets()
-        wanted, k = cloud.n * sheets.share, self.surface.method.neighbor_count(cloud.dim)
-        seen = wanted >= min(_STENCILS * k, wanted.max())
-        points = np.asarray(unchecked_surface(self, theta).cloud.points)
-        known = lambda counts: jnp.asarray([np.count_nonzero(counts), sheets.tunnels], jnp.int32)
-        if np.isfinite(points).all():
-            counts, before = sheets.counts(points), np.asarray(self.topology)
-            covered = (counts >= seen * wanted / _FEWER).all()
-            if covered and not before.any():
-                return eqx.tree_at(lambda s: s.topology, self, known(counts))
-            if covered and np.array_equal(before, known(counts)):
-                return self
-        chosen = spread(phi, look, sides, cloud.n, on=lambda x: seen[sheets.at(x)])
-        topology = known(sheets.counts(np.asarray(chosen.points)))
-        surface = _listed(self.surface, chosen, k, search)
-        return eqx.tree_at(lambda s: (s.surface, s.topology), self, (surface, topology))
 
 
 class MappedShape(AbstractShape):
@@ -246,7 +115,7 @@ class MappedShape(AbstractShape):
     base: Discretization | AbstractShape
 
     def __check_init__(self):
-        _function(self.f, "f")
+        check_function(self.f, "f")
         instance(self.base, (Discretization, AbstractShape), "base", "js.discretize makes one")
 
     def __call__(self, theta: PyTree) -> Discretization:
@@ -308,7 +177,7 @@ class NormalShape(AbstractShape):
     start: Float[Array, " n"]
 
     def __init__(self, surface: Discretization, start: Float[Array, " n"] | None = None):
-        _surface(surface)
+        check_surface(surface)
         start = jnp.zeros_like(surface.cloud.points[:, 0]) if start is None else start
         self.surface, self.start = surface, as_float(start, "start", (surface.n,))
 
@@ -320,10 +189,10 @@ class NormalShape(AbstractShape):
     def renewed(self, theta: Float[Array, " n"], search: NeighborSearch) -> NormalShape:
         """As of any shape; the surface at theta is the reference, its normals fitted again."""
         surface = unchecked_surface(self, theta)
-        points, normals, degree = *_geometry(surface), surface.method.polynomial_degree
+        points, normals, degree = *geometry(surface), surface.method.polynomial_degree
         normals = refit_normals(points, normals, surface.neighbors, degree=degree)
         found = surface.moved(points, normals, search=search)
-        return NormalShape(_with_lists(found, found), theta)
+        return NormalShape(with_lists(found, found), theta)
 
 
 def rigid_motion(
@@ -357,12 +226,12 @@ def rigid_motion(
     return jax.scipy.linalg.expm(matrix) @ x + shift
 
 
-def _function(f: Any, name: str) -> None:
+def check_function(f: Any, name: str) -> None:
     if not callable(f):
         raise TypeError(f"{name} is a {type(f).__name__}, expected a function of x and theta")
 
 
-def _surface(surface: Any) -> None:
+def check_surface(surface: Any) -> None:
     instance(surface, Discretization, "surface", "js.discretize(cloud) makes one")
 
 
@@ -390,32 +259,11 @@ def _followed(shape: AbstractShape, change: Callable) -> AbstractShape:
     return jax.tree.map(lambda x: change(x) if is_one(x) else x, shape, is_leaf=is_one)
 
 
-def _geometry(surface: Discretization) -> tuple[Array, Array]:
+def geometry(surface: Discretization) -> tuple[Array, Array]:
     return surface.cloud.points, surface.cloud.normals
 
 
-def _with_lists(surface: Discretization, found: Discretization) -> Discretization:
+def with_lists(surface: Discretization, found: Discretization) -> Discretization:
     """A surface with the lists of another of the same points."""
     lists = (found.neighbors, surface.method, surface.border, found.cloud.points)
     return Discretization(surface.cloud, *lists)
-
-
-def _listed(
-    surface: Discretization, cloud: PointCloud, k: int, search: NeighborSearch | None
-) -> Discretization:
-    """A surface of other points, with neighbours of their own in as many slots."""
-    points, normals = (a.astype(surface.cloud.points.dtype) for a in (cloud.points, cloud.normals))
-    cloud = PointCloud(points, normals)
-    near = find_neighbors(cloud, k, throw=False)
-    indices = np.repeat(np.arange(near.n, dtype=np.int32)[:, None], surface.neighbors.k, axis=1)
-    mask = np.zeros(indices.shape, bool)
-    indices[:, : near.k], mask[:, : near.k] = near.indices, near.mask
-    lists = unchecked(Neighbors, jnp.asarray(indices), jnp.asarray(mask))
-    new = Discretization(cloud, lists, surface.method, surface.border)
-    try:
-        found = new.moved(points, normals, search=search or new.search())
-    except ValueError:
-        if search is None:
-            raise
-        return _listed(surface, cloud, k, None)
-    return _with_lists(found, found)

@@ -110,10 +110,6 @@ EXPERIMENTS = {
         "Shapes: from a bumpy star to the sphere, by least area at fixed volume",
     ),
     "integrals": ("integrals", "Study: area, volume and integrals of curvature, by order"),
-    "neural-bunny": (
-        "neural_bunny",
-        "Shapes: a neural level set at the bunny's points, with the scan's first eigenvalues",
-    ),
     "sphere-flow": (
         "sphere_flow",
         "Mean curvature flow of the sphere until r = 0.3, against sqrt(1 - 2t)",

@@ -59,21 +59,26 @@ def spread_out(points, count: int) -> np.ndarray:
     return np.array(chosen)
 
 
-def readings(points, triangles, heaters, sensors) -> np.ndarray:
-    """Temperatures `(sensors, heaters)` at vertices, by linear finite elements."""
+def elements(points, triangles, kappa=1.0) -> tuple[sp.csc_matrix, sp.csc_matrix]:
+    """Stiffness and mass of linear finite elements, with a conductivity for each triangle."""
     corners = points[triangles]
     edges = corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]]  # opposite to each corner
     areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
-    kappa = np.exp(np.asarray(true(corners.mean(axis=1))))
     rows, columns = np.repeat(triangles, 3, axis=1), np.tile(triangles, 3)
     stiff = np.einsum("t,tid,tjd->tij", kappa / (4 * areas), edges, edges)
     mass = areas[:, None, None] / 12 * (1 + np.eye(3))
     assembled = lambda entries: sp.csc_matrix(
         (entries.ravel(), (rows.ravel(), columns.ravel())), shape=2 * (len(points),)
     )
-    M = assembled(mass)
-    solve = sla.factorized(_LOSS * M + assembled(stiff))
-    right = M @ np.asarray(heat(points, heaters))
+    return assembled(stiff), assembled(mass)
+
+
+def readings(points, triangles, heaters, sensors) -> np.ndarray:
+    """Temperatures `(sensors, heaters)` at vertices, by linear finite elements."""
+    kappa = np.exp(np.asarray(true(points[triangles].mean(axis=1))))
+    stiff, mass = elements(points, triangles, kappa)
+    solve = sla.factorized(_LOSS * mass + stiff)
+    right = mass @ np.asarray(heat(points, heaters))
     return np.stack([solve(f)[sensors] for f in right.T], axis=1)
 
 

@@ -30,7 +30,7 @@ from .design.functionals import moments as moments
 from .design.functionals import volume as volume
 from .design.harmonics import spherical_harmonics as spherical_harmonics
 from .design.harmonics import star_shape as star_shape
-from .design.level_set import LevelSetShape as LevelSetShape
+from .design.level_sets import LevelSetShape as LevelSetShape
 from .design.optimize import optimize_shape as optimize_shape
 from .design.outcome import OptimizationError as OptimizationError
 from .design.outcome import ShapeOptimization as ShapeOptimization

@@ -29,7 +29,7 @@ from .shape import (
     with_lists,
 )
 
-# Steps of repulsion by which points are spread again over a level set.
+# Steps of repulsion by which points are spread again.
 _SPREAD = 10
 # A sheet gets points if they fill so many stencils; with fewer than wanted by this factor it is
 # sampled anew.

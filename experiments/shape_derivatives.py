@@ -24,7 +24,7 @@ _RADIUS, _TIME = 0.5, 0.1
 _BOUND, _DEFAULT = 1e-5, 1e-4
 # Of the reference, and of one to compare it with.
 _DEGREE, _COARSE = 12, 8
-_METHODS: list[Method] = [js.GFDM(degree=4), js.DCPSE(order=4)]
+_METHODS: list[Method] = [js.GFDM(degree=4), js.DCPSE(order=4), js.GFDM(degree=6)]
 
 
 def bump(x):
@@ -172,19 +172,20 @@ def run(quick: bool, out: Path) -> list[Row]:
 def _picture(path: Path, sizes, drawn) -> None:
     """A panel for each surface and method."""
     panels = list(dict.fromkeys(at[:2] for at in drawn))
-    figure, axes = plt.subplots(2, -(-len(panels) // 2), figsize=(9, 8), sharey=True,
-                                layout="constrained", squeeze=False)  # fmt: skip
+    columns = len(panels) // 2
+    figure, axes = plt.subplots(2, columns, figsize=(4 * columns, 8), sharey=True,
+                                layout="constrained")  # fmt: skip
     for ax, panel in zip(axes.ravel(), panels):
         for (*at, key, what), pair in drawn.items():
             if tuple(at) == panel:
                 kind = "s--" if what == "normals" else "o-"
                 color = f"C{list(dict.fromkeys(k for *_, k, _ in drawn)).index(key)}"
-                label = f"{key}, {what}"
+                label = f"{key}, {'normals' if what == 'normals' else 'axes or radii'}"
                 ax.loglog(sizes, pair, kind, color=color, label=label, markersize=4)
         ax.axhline(_BOUND, color="k", linewidth=0.8, linestyle=":")
         ax.set_title(", ".join(panel), fontsize="medium")
         ax.set_xlabel("points")
-        ax.legend(frameon=False, fontsize=6, ncols=2)
+    axes[0, -1].legend(frameon=False, fontsize=7, ncols=2)
     axes[0, 0].set_ylabel("relative error of the derivative")
     figure.savefig(path, dpi=130)
     plt.close(figure)

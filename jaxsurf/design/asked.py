@@ -10,7 +10,7 @@ import optax
 
 from ..arguments import instance
 from ..time.checkpoint import Checkpoint
-from .lagrangian import Values
+from .lagrangian import CROSSED, Values
 from .outcome import COLUMNS
 from .shape import AbstractShape
 
@@ -21,6 +21,7 @@ ILL = {
     2: "the surface folds",
     3: "the objective, a constraint or the gradient is not finite",
     FAR: "lists of neighbours do not reach",
+    CROSSED: "the surface passes through itself",
 }
 
 

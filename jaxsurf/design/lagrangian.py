@@ -16,10 +16,13 @@ from ..compiling import sized_jit
 from ..discretization import Discretization
 from ..failures import marking
 from ..motion import judged, unreached
+from .crossing import crosses
 from .shape import AbstractShape
 
 # Lists are found anew once points outside may come as near as this share of the farthest in them.
 _WORN = 0.75
+# Beside the codes of `Discretization.code`.
+CROSSED = 5
 
 
 class Multipliers(NamedTuple):
@@ -40,7 +43,8 @@ class Values(NamedTuple):
         gradient: of that, in the parameters.
         size: the norm of the gradient; under a projection, of the step along it that this leaves.
         code: what is wrong: 0 nothing, 1 points that are not finite, 2 a fold, 3 a Lagrangian
-            or gradient that is not, 4 lists of neighbours that no longer reach.
+            or gradient that is not, 4 lists of neighbours that no longer reach, 5 a surface that
+            passes through itself.
         worn: whether lists of neighbours should be found anew.
         forced: the multipliers that the constraints were met with.
     """
@@ -106,6 +110,8 @@ def _judged(surface: Discretization) -> tuple[Array, Array]:
     fixed = jax.lax.stop_gradient(surface)
     cloud, neighbors, found_at = fixed.cloud, fixed.neighbors, fixed.found_at
     code = jnp.max(judged(cloud, neighbors, jnp.zeros(cloud.n, cloud.points.dtype)))
+    if fixed.border is None:
+        code = jnp.where((code == 0) & crosses(cloud, neighbors), CROSSED, code)
     if found_at is None:
         return code, jnp.zeros((), bool)
     far = lambda *share: jnp.any(unreached(found_at, cloud.points, neighbors, *share))

@@ -40,11 +40,12 @@ def optimize_shape(
 
     Constraints are met by an augmented Lagrangian: multipliers that are corrected whenever its
     gradient has fallen tenfold, or every 20 steps, and a penalty that grows fourfold where that
-    does not serve. Steps after which the surface folds or a number is not finite are halved.
-    Neighbours are found anew once the surface was sheared or stretched by about an eighth
-    (`AbstractShape.renewed`), points are chosen anew where a level set in `bounds` has other parts
-    (`js.LevelSetShape`); the optimiser keeps its state, and nothing is compiled again. Only L-BFGS
-    begins again where the points that are chosen cannot follow back to the step before.
+    does not serve. Steps after which the surface folds or passes through itself, or a number is
+    not finite, are halved. Neighbours are found anew once the surface was sheared or stretched by
+    about an eighth (`AbstractShape.renewed`), points are chosen anew where a level set in `bounds`
+    has other parts (`js.LevelSetShape`); the optimiser keeps its state, and nothing is compiled
+    again. Only L-BFGS begins again where the points that are chosen cannot follow back to the step
+    before.
 
     Args:
         objective: $f(S)$, of a `Discretization` and `args`; returns a number.

@@ -37,16 +37,17 @@ def crosses(cloud: PointCloud, neighbors: Neighbors) -> Bool[Array, ""]:
     spacing = jnp.sum(jnp.where(mask, squared, 0), axis=1) / jnp.maximum(jnp.sum(mask, axis=1), 1)
     areas = switched_off(on, spacing ** ((cloud.dim - 1) / 2))
 
-    def turns(point):
+    def turns(one):
+        i, point = one
         apart = x - point
         distance = jnp.sum(apart**2, axis=1)
-        angles = jnp.sum(normals * apart, axis=1) / jnp.where(distance == 0, 1, distance) ** (
-            cloud.dim / 2
-        )
-        return areas @ angles
+        # Not by distance alone: the compiler may find a point twice, and differently rounded.
+        same = (jnp.arange(cloud.n) == i) | (distance == 0)
+        angles = jnp.sum(normals * apart, axis=1) / jnp.where(same, 1, distance) ** (cloud.dim / 2)
+        return areas @ jnp.where(same, 0, angles)
 
     probes = slice(None, None, max(1, -(-cloud.n // _PROBES)))
-    found = jax.lax.map(turns, x[probes], batch_size=_BLOCK)
+    found = jax.lax.map(turns, (jnp.arange(cloud.n)[probes], x[probes]), batch_size=_BLOCK)
     if on is not None:
         found = switched_off(on[probes], found, jnp.nan)
     turned = found / (2 * jnp.nanmedian(found))

@@ -22,7 +22,7 @@ from .shape import AbstractShape
 # Lists are found anew once points outside may come as near as this share of the farthest in them.
 _WORN = 0.75
 # Beside the codes of `Discretization.code`.
-CROSSED = 5
+CROSSED = 6
 
 
 class Multipliers(NamedTuple):
@@ -43,7 +43,7 @@ class Values(NamedTuple):
         gradient: of that, in the parameters.
         size: the norm of the gradient; under a projection, of the step along it that this leaves.
         code: what is wrong: 0 nothing, 1 points that are not finite, 2 a fold, 3 a Lagrangian
-            or gradient that is not, 4 lists of neighbours that no longer reach, 5 a surface that
+            or gradient that is not, 4 lists of neighbours that no longer reach, 6 a surface that
             passes through itself.
         worn: whether lists of neighbours should be found anew.
         forced: the multipliers that the constraints were met with.

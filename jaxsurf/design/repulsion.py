@@ -59,11 +59,12 @@ def tangent_point_energy(surface: Discretization, *, power: int = 6) -> Float[Ar
 @functools.partial(jax.jit, static_argnums=3)
 def _energy(x, normals, areas, power: int):
     def seen_from(one):
-        point, normal, area = one
-        return area * (_bends(point, normal, x) ** (power // 2) @ areas)
+        i, point, normal, area = one
+        return area * (_bends(i, point, normal, x) ** (power // 2) @ areas)
 
     # Recomputed in reverse mode: nothing of the size of all pairs is kept.
-    rows = jax.lax.map(jax.checkpoint(seen_from), (x, normals, areas), batch_size=_BLOCK)
+    each = (jnp.arange(len(x)), x, normals, areas)
+    rows = jax.lax.map(jax.checkpoint(seen_from), each, batch_size=_BLOCK)
     return jnp.sum(rows) / 2**power
 
 
@@ -104,16 +105,23 @@ def medial_radius(surface: Discretization) -> Float[Array, " n"]:
 @jax.jit
 def _radius(x, normals, on):
     fixed = stop_gradient(x)
-    other = lambda one: jnp.argmax(switched_off(on, _bends(one[0], one[1], fixed), -1))
-    y = x[jax.lax.map(other, (fixed, stop_gradient(normals)), batch_size=_BLOCK)]
-    squared = jax.vmap(lambda x, normal, y: _bends(x, normal, y[None])[0])(x, normals, y)
+    other = lambda one: jnp.argmax(switched_off(on, _bends(one[0], one[1], one[2], fixed), -1))
+    each = (jnp.arange(len(x)), fixed, stop_gradient(normals))
+    apart = x[jax.lax.map(other, each, batch_size=_BLOCK)] - x
+    squared = _squared(jnp.sum(apart * normals, axis=1), jnp.sum(apart**2, axis=1))
     plane = squared == 0
     return jnp.where(plane, jnp.inf, 1 / jnp.sqrt(jnp.where(plane, 1, squared)))
 
 
-def _bends(point, normal, x) -> Float[Array, " n"]:
-    """Squares of the curvatures of balls that touch at one point and pass through others."""
+def _bends(i, point, normal, x) -> Float[Array, " n"]:
+    """Squares of the curvatures of balls that touch at point i and pass through others."""
     apart = x - point
-    squared, height = jnp.sum(apart**2, axis=1), apart @ normal
-    here = squared == 0
-    return jnp.where(here, 0, (2 * height / jnp.where(here, 1, squared)) ** 2)
+    # Not by distance: the compiler may find the same point twice, and differently rounded.
+    same = jnp.arange(len(x)) == i
+    return jnp.where(same, 0, _squared(apart @ normal, jnp.sum(apart**2, axis=1)))
+
+
+def _squared(height, distance):
+    """Of the curvature of a ball; 0 where there is none, in switched-off rows say."""
+    here = distance == 0
+    return jnp.where(here, 0, (2 * height / jnp.where(here, 1, distance)) ** 2)

@@ -27,6 +27,7 @@ from .curvature import tube_ratio as tube_ratio
 from .design.functionals import chamfer_distance as chamfer_distance
 from .design.functionals import compliance as compliance
 from .design.functionals import moments as moments
+from .design.functionals import signed_distance as signed_distance
 from .design.functionals import volume as volume
 from .design.harmonics import spherical_harmonics as spherical_harmonics
 from .design.harmonics import star_shape as star_shape

@@ -108,6 +108,41 @@ def test_distances():
     np.testing.assert_allclose([found, slope], [0.02, 0.4], rtol=1e-6)
 
 
+def test_signed_distances():
+    """Of points above and below a torus, by its order; the derivative in a point is the normal."""
+    surfaces = [reference(n) for n in (500, 2_000)]
+    x = js.torus(80, R, r)
+    away = jnp.linspace(-0.25, 0.25, 80)
+    points = x.points + away[:, None] * x.normals
+    found = [js.signed_distance(surface, points) for surface in surfaces]
+    errors = [float(jnp.abs(one - away).max()) for one in found]
+    assert errors[1] < 2e-5 and np.log2(errors[0] / errors[1]) > 3.5, errors
+    # The normal is a derivative of the polynomial: of one order less.
+    slopes = [jax.grad(lambda y, s=s: js.signed_distance(s, y).sum())(points) for s in surfaces]
+    off = [float(jnp.abs(slope - x.normals).max()) for slope in slopes]
+    assert off[1] < 1e-3 and np.log2(off[0] / off[1]) > 2.8, off
+
+
+def test_derivatives_of_signed_distances():
+    """In the shape against differences, both modes, compiled and mapped, and in 32 bits."""
+    targets = 0.9 * ball().cloud.points[::20]
+    weights = jnp.sin(jnp.arange(20.0))
+    value = lambda axes: weights @ js.signed_distance(stretched(axes), targets)
+    axes, direction = jnp.array([1.0, 0.9, 0.8]), jnp.array([0.3, -0.2, 0.4])
+    found = js.taylor_remainders(value, axes, direction, steps=jnp.array([1e-3, 3e-4, 1e-4]))
+    assert abs(found.slope - 2) < 0.05, found
+    forward = jax.jvp(value, (axes,), (direction,))[1]
+    np.testing.assert_allclose(found.derivative, forward, rtol=1e-9)
+    several = jax.jit(jax.vmap(value))(jnp.stack([axes, 1.05 * axes]))
+    np.testing.assert_allclose(several[0], value(axes), rtol=1e-9)
+    single = lambda a: a.astype(jnp.float32)
+    cloud = js.PointCloud(single(ball().cloud.points), single(ball().cloud.normals))
+    less = js.discretize(cloud, ball().neighbors, method=js.GFDM(degree=2))
+    found = js.signed_distance(less, single(targets))
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, js.signed_distance(ball(), targets), atol=1e-5)
+
+
 def test_curves_compiled_mapped_and_in_single_precision():
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)

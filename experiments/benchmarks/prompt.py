@@ -244,6 +244,11 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
         "surface",
         lambda m: js.chamfer_distance(m.surface, 1.1 * m.cloud.points[::2]),
     ),
+    "signed_distance": (
+        "closed",
+        "surface",
+        lambda m: js.signed_distance(m.surface, 1.01 * m.cloud.points[::2]),
+    ),
     "tangent_point_energy": ("closed", "surface", lambda m: js.tangent_point_energy(m.surface)),
     "medial_radius": ("closed", "surface", lambda m: js.medial_radius(m.surface)),
     "sobolev_gradient": (

@@ -116,6 +116,17 @@ TESTED = {
         "float32": _SOB + "test_single_precision_and_fields_with_components",
         "bad input": "malformed",
     },
+    "signed_distance": {
+        "value": _FUN + "test_signed_distances",
+        "gradient": {
+            "y": _FUN + "test_signed_distances",
+            "points, normals": _FUN + "test_derivatives_of_signed_distances",
+        },
+        "jit": _FUN + "test_derivatives_of_signed_distances",
+        "vmap": _FUN + "test_derivatives_of_signed_distances",
+        "float32": _FUN + "test_derivatives_of_signed_distances",
+        "bad input": "malformed",
+    },
     "LevelSetShape": {
         "value": _SHAPE + "test_points_and_normals_are_those_of_the_shape",
         "gradient": {"theta": _SHAPE + "test_derivatives_are_differences_of_shapes_made_anew"},

@@ -19,7 +19,6 @@ SIZES = {
     "isoperimetric": (2_000, 600),
     "hear-the-shape": (3_000, 800),
     "hot-spot": (2_000, 600),
-    "neural-bunny": (2_000, 800),
     "control": (1_000, 300),
     "conductivity": (4_000, 1_000),
     "vesicles": (1_500, 600),

@@ -13,9 +13,9 @@ The scan's eigenvalues come from linear finite elements on all its triangles; no
 rims of its holes (five, at the base), which the level set closes. What a coarse sampling of the
 level set does to eigenvalues is measured on a finer one, and taken out of what is asked for.
 
-Not among the experiments yet, since it does not keep its bounds: eigenvalues come within 1.3 to 3.2
-per cent of the scan's at n = 4,500, at a distance of 0.7 per cent of the diagonal, where the rims of
-ears and base fold; one per cent is asked for.
+Not among the experiments yet, as it does not keep its bounds: eigenvalues come within 1.3 to 3.2
+per cent of the scan's at n = 4,500, at a distance of 0.7 per cent of the diagonal, where the rims
+of ears and base fold; one per cent is asked for.
 """
 
 from __future__ import annotations

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 
 import jaxsurf as js
 
+from .pictures import descent
 from .report import Row
 
 _METHOD, _STEPS = js.GFDM(degree=2), 8
@@ -135,12 +136,7 @@ def _picture(path: Path, start, end, work, history) -> None:
     js.plot_cloud(start.cloud, work, ax=axes[0], title="start", label="work on the way", view=view)
     js.plot_cloud(end.cloud, distances(end.cloud.points), ax=axes[1], title="end", view=view,
                   label="distance from the target")  # fmt: skip
-    axes[2].semilogy(history["objective"], label="objective")
-    axes[2].semilogy(history["gradient"], label="gradient")
-    renewed = np.flatnonzero(history["renewed"])
-    axes[2].plot(renewed, history["gradient"][renewed], "k|", label="neighbours found anew")
-    axes[2].set_xlabel("step")
-    axes[2].legend(fontsize=8, frameon=False)
+    descent(axes[2], history, {"objective": "objective", "gradient": "gradient"})
     figure.savefig(path, dpi=130)
     plt.close(figure)
 

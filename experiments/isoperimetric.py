@@ -18,6 +18,7 @@ from jaxtyping import Array
 
 import jaxsurf as js
 
+from .pictures import descent
 from .report import Row
 
 _DEGREE = 4
@@ -66,15 +67,9 @@ def _picture(path: Path, start, found: js.ShapeOptimization, excess) -> None:
     for ax, surface, title in ((axes[0], start, "start"), (axes[1], found.surface, "end")):
         js.plot_cloud(surface.cloud, surface.mean_curvature, ax=ax, title=title, limits=(-3, 3),
                       label="mean curvature")  # fmt: skip
-    rows = found.history
-    steps = np.arange(len(excess))
-    axes[2].semilogy(steps, excess, label="area over the least, less 1")
-    axes[2].semilogy(steps, rows["violation"], label="violation of the volume")
-    axes[2].semilogy(steps, rows["gradient"], label="gradient")
-    renewed = np.flatnonzero(rows["renewed"])
-    axes[2].plot(renewed, rows["gradient"][renewed], "k|", label="neighbours found anew")
-    axes[2].set_xlabel("step")
-    axes[2].legend(fontsize=8, frameon=False)
+    axes[2].semilogy(excess, label="area over the least, less 1")
+    labels = {"violation": "violation of the volume", "gradient": "gradient"}
+    descent(axes[2], found.history, labels)
     figure.savefig(path, dpi=130)
     plt.close(figure)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 
 
 def convergence(
@@ -39,3 +40,13 @@ def convergence(
     ax.legend(fontsize=8, frameon=False)
     figure.savefig(path, dpi=150)
     plt.close(figure)
+
+
+def descent(ax: Axes, history: Mapping[str, np.ndarray], labels: Mapping[str, str]) -> None:
+    """Columns of an optimisation's history over its steps, and where neighbours were found anew."""
+    for name, label in labels.items():
+        ax.semilogy(history[name], label=label)
+    renewed = np.flatnonzero(history["renewed"])
+    ax.plot(renewed, history["gradient"][renewed], "k|", label="neighbours found anew")
+    ax.set_xlabel("step")
+    ax.legend(fontsize=8, frameon=False)

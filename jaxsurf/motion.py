@@ -26,7 +26,7 @@ CODES = {
 _SKIN = 0.5
 
 # Each brings normals closer to where a rigid motion takes them, by the error of the gradient.
-_TURNS = 4
+_TURNS = 5
 
 
 def moved_cloud(cloud: PointCloud, points, normals, gradient: Callable[[], Callable]) -> PointCloud:
@@ -64,7 +64,8 @@ def carried(gradient, normals, before, after):
     images = [switched_off(on, image, tangents) for image in images]
     a = jnp.einsum("ntx,nux->ntu", images[0], tangents)
     s = jnp.einsum("ntx,nx->nt", images[0], normals)
-    ahead = jnp.zeros_like(normals)
+    # Where nothing moves they stay as they are, however large that error is.
+    ahead = normals
     for _ in range(_TURNS):
         normal = crossed(_solved(a, images[1] - s[:, :, None] * ahead[:, None]))
         length = jnp.sqrt(jnp.sum(normal**2, axis=1))

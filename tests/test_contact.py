@@ -195,6 +195,35 @@ def test_sheets_are_kept_apart():
     np.testing.assert_array_equal(end[off], x[off])
 
 
+@pytest.mark.slow
+def test_sheets_that_merge_move_as_one():
+    """They approach and slide until 0.3; then one is at rest, the other drawn away and on."""
+    d, n = 0.2, 100
+    flat = np.stack(np.meshgrid(*(np.linspace(-0.5, 0.5, 10),) * 2), axis=2).reshape(-1, 2)
+    x = np.c_[np.tile(flat, (2, 1)), np.repeat([-0.2, 0.2], n)]
+    low = np.arange(2 * n) < n
+    cloud = js.PointCloud(x, np.where(low, -1, 1)[:, None] * np.array([[0.0, 0, 1]]))
+    meet, part = jnp.array([0.0, 0, 1]), jnp.array([0.3, 0, 0.5])
+
+    def velocity(t, surface, fields, args):
+        return jnp.where(t < 0.6, jnp.where(low, 1, -1)[:, None] * meet, ~low[:, None] * part)
+
+    def moved(kind):
+        given = dict(method=METHOD, contact=js.Contact(d, kind=kind), rtol=1e-6)
+        run = js.evolve(js.Motion(velocity), cloud, t1=1.6, saveat=[0.6], **given)
+        # The middle of plates: at rims the other has points to one side only.
+        middle = np.abs(x[:, :2]).max(axis=1) < 0.3
+        ways = [np.asarray(b.points - a.points) for a, b in zip(run.clouds, run.clouds[1:])]
+        return (way[middle & rows].mean(axis=0) for way in ways for rows in (low, ~low))
+
+    below, above = moved("merge")
+    np.testing.assert_allclose(below, above, atol=0.02)
+    np.testing.assert_allclose(below, [0.15, 0, 0.25], atol=0.02)
+    below, above = moved("non-penetration")
+    np.testing.assert_allclose(below, 0, atol=1e-9)
+    np.testing.assert_allclose(above, [0.3, 0, 0.5], atol=1e-9)
+
+
 def test_in_single_precision():
     """The same sheets face each other; velocities and what closes the cut are within 1e-5."""
     cloud, found, values, velocity = with_a_waist(0.12), [], [], []

@@ -2,7 +2,7 @@ r"""Sheets of a surface that come near each other: which points face which, and 
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,7 +16,8 @@ from ..arguments import instance, real
 from ..cloud import PointCloud
 from ..neighbors import Neighbors
 
-KINDS = ("delete", "non-penetration")
+Kind = Literal["delete", "non-penetration", "merge"]
+KINDS = get_args(Kind)
 # Points face each other if the cosine of their normals is below, and if the way from one to the
 # other leaves both sheets steeply: its cosine with their normals is above.
 _OPPOSED, _STEEP = -0.45, 0.85
@@ -34,19 +35,21 @@ class Contact(eqx.Module):
 
     Sheets are of two surfaces or of one, and meet from outside, or through the inside of a part
     that has become thin. Those are found by their normals, which oppose each other. Only sheets of
-    two surfaces that are kept apart may have normals that point the same way.
+    two surfaces that are kept apart, or stick, may have normals that point the same way.
 
     Args:
         distance: at which sheets touch, in length. For "delete" three to five spacings: a neck is
             that thick when it pinches off (or 1.2 times so: sheets may face each other at a slant),
-            and must still carry stencils. For "non-penetration" two or more.
+            and must still carry stencils. For the others two or more.
         kind: "delete" cuts out what touches and closes what is left: a neck pinches off, two drops
             become one, what is thinner everywhere vanishes. The new parts are the zero set of a
             smooth function that passes through the points around with their normals; fields there
             are means of those around, and with `Adaptation(conserve=True)` what was held by the
             parts that go is spread over all that is left. It needs `adapt`, and a closed surface
             there. "non-penetration" takes away the velocity with
-            which sheets approach, half from each, more and more from twice the distance on.
+            which sheets approach, half from each, more and more from twice the distance on: they
+            may slide and part. "merge" takes away all of their relative velocity so: they stick,
+            and move as one sheet of two sides from then on.
 
     Accuracy: looks follow each other so that sheets come nearer by at most a fifth of the distance
         unseen; new parts pass through the points around (`tests/test_contact.py`); in float32
@@ -70,12 +73,12 @@ class Contact(eqx.Module):
     """
 
     distance: Float[Array, ""]
-    kind: Literal["delete", "non-penetration"] = eqx.field(static=True)
+    kind: Kind = eqx.field(static=True)
 
-    def __init__(self, distance, kind: Literal["delete", "non-penetration"] = "delete"):
+    def __init__(self, distance, kind: Kind = "delete"):
         self.distance = jnp.asarray(real(distance, "distance", above=0))
         if kind not in KINDS:
-            raise ValueError(f"kind = {kind!r}, expected 'delete' or 'non-penetration'")
+            raise ValueError(f"kind = {kind!r}, expected one of {', '.join(map(repr, KINDS))}")
         self.kind = kind
 
     @property
@@ -138,6 +141,7 @@ class Faced(eqx.Module):
         side: 1 if it is outside of those, as their normals tell, else -1.
         width: of the weights of those points.
         distance: at which sheets touch.
+        stick: nor do they slide or part.
     """
 
     indices: Int[Array, "n f"]
@@ -145,9 +149,10 @@ class Faced(eqx.Module):
     side: Float[Array, " n"]
     width: Float[Array, " n"]
     distance: Float[Array, ""]
+    stick: bool = eqx.field(static=True)
 
     def kept_apart(self, points, normals, velocity) -> Float[Array, "n d"]:
-        r"""The velocity less half of that with which sheets approach.
+        r"""The velocity less half of that with which sheets approach, or all that is relative.
 
         The other sheet near x is where $s = \sum_j w_j (x - x_j)\cdot n_j / \sum_j w_j$ vanishes,
         with Gaussian weights: at distance s.
@@ -166,9 +171,10 @@ class Faced(eqx.Module):
         out = out / jnp.sqrt(jnp.maximum(jnp.sum(out**2, axis=1, keepdims=True), 0.01))
         relative = velocity - jnp.sum(share * velocity[self.indices], axis=1)
         approach = jnp.minimum(jnp.sum(relative * out, axis=1), 0)
+        wrong = relative if self.stick else approach[:, None] * out
         near = jnp.clip(2 - gap / self.distance, 0, 1)
         near = jnp.where(total[:, 0] > 0, near**2 * (3 - 2 * near), 0)
-        return velocity - (near * approach / 2)[:, None] * out
+        return velocity - (near / 2)[:, None] * wrong
 
 
 def watched(
@@ -209,7 +215,8 @@ def _others(contact: Contact, cloud: PointCloud, neighbors: Neighbors):
     outside = np.where(np.sum((x - x[other]) * n[other], axis=1) < 0, -1.0, 1.0)
     numbers = (outside, h, contact.distance)
     side, width, distance = (jnp.asarray(a, cloud.points.dtype) for a in numbers)
-    return h, Faced(jnp.asarray(indices), jnp.asarray(mask), side, width, distance)
+    lists = (jnp.asarray(indices), jnp.asarray(mask))
+    return h, Faced(*lists, side, width, distance, contact.kind == "merge")
 
 
 def _spacings(cloud: PointCloud, neighbors: Neighbors) -> Float[np.ndarray, " n"]:

@@ -203,7 +203,7 @@ class _Run:
         every = np.inf if self.adapt is None or self.adapt.every is None else self.adapt.every
         end = target
         while float(self.t) < float(target) and not self.gone:
-            end = min(end, self.t + every)
+            end = min(end, self.t + every, self.next_look())
             surface, neighbors = self.moving.surface, self.moving.surface.neighbors
             start, uneven = surface.cloud.points, self.adapt is not None
             event = dfx.Event(_Worn(start, neighbors, self.free, uneven))
@@ -226,6 +226,15 @@ class _Run:
             self.t, self.state, end = reached, new, target
             if solution.result == dfx.RESULTS.event_occurred or float(reached) < float(target):
                 self.renew()
+
+    def next_look(self) -> float:
+        """When sheets are to be looked at again, at the speed that they have now."""
+        if self.contact is None or self.free is None:
+            return np.inf
+        velocity = _velocity(self.moving, self.t, self.state, self.options["args"])
+        speed = np.linalg.norm(np.asarray(velocity, float), axis=1)
+        limit = np.asarray(self.free, float) + _PAST / 2 * float(self.contact.distance)
+        return float(self.t) + np.min(limit / np.maximum(speed, np.finfo(float).tiny))
 
     def may_cross(self, points) -> bool:
         """Whether sheets were so near each other that they may have crossed."""
@@ -291,6 +300,11 @@ class _Run:
         if any(count):
             self.changes = np.append(self.changes, [[float(self.t), *count]], axis=0)
         return any(count)
+
+
+@eqx.filter_jit
+def _velocity(moving: Moving, t, state, args) -> Float[Array, "n d"]:
+    return moving.rate(t, state, args)[0]
 
 
 class _Worn(eqx.Module):

@@ -27,7 +27,8 @@ _CUT = 1.5
 _AROUND, _MOST = 4.0, 300
 # Middles that are nearer than this, in contact distances, tell the same.
 _SAME = 0.5
-# Tries for a place in each ball, in volumes of a ball of a spacing; Newton steps to the surface.
+# Tries for a place where it was cut out, in volumes of a ball of a spacing; Newton steps to the
+# surface.
 _TRIES, _STEPS = 30, 12
 _CLOSE = 1e-9
 # A value at a new point is the mean over so many points around.
@@ -105,24 +106,35 @@ def _closed(cloud, around, places, inside: Bool[np.ndarray, " m"], distance: flo
     # What was inside between the sheets is outside now, and the other way round.
     surface = HermiteSurface(x, n, places, np.where(inside, distance, -distance), h)
     rng, dim, size = np.random.default_rng(0), cloud.dim, _CUT * distance
-    count = int(_TRIES * len(places) * max(1.0, size / h) ** dim)
+    balls = len(poisson_disk(places, size / 2))
+    count = int(_TRIES * balls * max(1.0, size / h) ** dim)
     ways = rng.normal(size=(count, dim))
     ways *= (rng.random(count) ** (1 / dim) / np.linalg.norm(ways, axis=1))[:, None]
     tries = places[rng.integers(len(places), size=count)] + size * ways
-    for _ in range(_STEPS):
-        value, slope = surface(tries)
-        length = np.linalg.norm(slope, axis=1)
-        length = np.where(length > 0, length, 1.0)
-        step = np.clip(value / length, -distance / 2, distance / 2)
-        tries = tries - (step / length)[:, None] * slope
-    value, slope = surface(tries)
-    good = np.abs(value) <= _CLOSE * distance
-    good &= cKDTree(places).query(tries)[0] <= size + h
+    tries, slope = _onto(surface, tries, distance)
+    good = cKDTree(places).query(tries)[0] <= size + h
     good &= cKDTree(x).query(tries)[0] >= DISK * h
     tries, slope = tries[good], slope[good]
     kept = poisson_disk(tries, DISK * h) if len(tries) else np.zeros(0, int)
     normals = slope[kept] / np.linalg.norm(slope[kept], axis=1, keepdims=True)
     return tries[kept], normals
+
+
+def _onto(surface: HermiteSurface, tries, distance: float):
+    """Those that Newton's method takes to the surface, and the gradients there."""
+    moving, slopes, there = np.arange(len(tries)), np.zeros_like(tries), np.zeros(len(tries), bool)
+    for left in range(_STEPS, -1, -1):
+        value, slope = surface(tries[moving])
+        done = np.abs(value) <= _CLOSE * distance
+        there[moving[done]], slopes[moving[done]] = True, slope[done]
+        moving, value, slope = moving[~done], value[~done], slope[~done]
+        if not left or not len(moving):
+            break
+        length = np.linalg.norm(slope, axis=1)
+        length = np.where(length > 0, length, 1.0)
+        step = np.clip(value / length, -distance / 2, distance / 2)
+        tries[moving] -= (step / length)[:, None] * slope
+    return tries[there], slopes[there]
 
 
 class HermiteSurface:

@@ -75,7 +75,7 @@ CALLS = [
     ("evolve", "contact in compiled code", lambda: jax.jit(lambda a: evolve(args=a, contact=js.Contact(0.1, "non-penetration")).ts)(1.0), ("contact", "host")),
     ("Contact", "no distance", lambda: js.Contact(0.0), ("distance", "0")),
     ("Contact", "a distance as text", lambda: js.Contact("0.1"), ("distance", "0.1")),
-    ("Contact", "a kind that there is not", lambda: js.Contact(0.1, kind="merge"), ("kind", "merge", "delete", "non-penetration")),
+    ("Contact", "a kind that there is not", lambda: js.Contact(0.1, kind="weld"), ("kind", "weld", "delete", "non-penetration", "merge")),
     ("evolve", "a tolerance of one", lambda: evolve(rtol=1.0), ("rtol", "1")),
     ("Motion", "an array", lambda: js.Motion(np.ones((N, 3))), ("velocity", "ndarray", "function")),
     ("Motion", "nothing", lambda: js.Motion(None), ("velocity", "None", "function")),

@@ -73,6 +73,10 @@ EXPERIMENTS = {
         "e18_expanding_wave",
         "Waves with a source on the expanding sphere, errors of space (paper 002, Table 4)",
     ),
+    "E19": (
+        "e19_armadillo",
+        "Waves on the Armadillo, which collapses and comes apart (paper 002, Fig. 16)",
+    ),
     "accuracy": (
         "accuracy",
         "Study: error of the Laplacian on the unit sphere, with defaults, beside other codes",

@@ -112,6 +112,19 @@ def test_plane_curves_pinch_too():
     assert abs(float(turning) / (2 * np.pi) - 2) < 0.1
 
 
+def test_a_part_of_too_few_points_vanishes():
+    """Though nothing of it faces anything: no stencil has room on it."""
+    few = METHOD.neighbor_count(3) - 1
+    x = [np.asarray(js.sphere(n).points) for n in (300, few)]
+    cloud = js.PointCloud(np.concatenate([x[0], 0.3 * x[1] + [2.0, 0, 0]]), np.concatenate(x))
+    neighbors = js.find_neighbors(cloud, METHOD.neighbor_count(3))
+    surface = js.Discretization(cloud, neighbors, METHOD)
+    assert not len(facing(cloud, 0.2).pairs)
+    after, _, found = rejoined(surface, (), 0.2, np.full(cloud.n, 0.2), None)
+    assert (found.pinched, found.joined, found.vanished) == (0, 0, 1)
+    np.testing.assert_array_equal(after.cloud.host_active, np.arange(cloud.n) < 300)
+
+
 def shrinking(t, surface, fields, args):
     return -surface.cloud.normals
 

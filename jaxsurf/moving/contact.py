@@ -42,14 +42,14 @@ class Contact(eqx.Module):
             that thick when it pinches off (or 1.2 times so: sheets may face each other at a slant),
             and must still carry stencils. For the others two or more.
         kind: "delete" cuts out what touches and closes what is left: a neck pinches off, two drops
-            become one, what is thinner everywhere vanishes. The new parts are the zero set of a
-            smooth function that passes through the points around with their normals; fields there
-            are means of those around, and with `Adaptation(conserve=True)` what was held by the
-            parts that go is spread over all that is left. It needs `adapt`, and a closed surface
-            there. "non-penetration" takes away the velocity with
-            which sheets approach, half from each, more and more from twice the distance on: they
-            may slide and part. "merge" takes away all of their relative velocity so: they stick,
-            and move as one sheet of two sides from then on.
+            become one, what is thinner everywhere vanishes, and so does a part with fewer points
+            than a stencil asks for. The new parts are the zero set of a smooth function that passes
+            through the points around with their normals; fields there are means of those around,
+            and with `Adaptation(conserve=True)` what was held by the parts that go is spread over
+            all that is left. It needs `adapt`, and a closed surface there.
+            "non-penetration" takes away the velocity with which sheets approach, half from each,
+            more and more from twice the distance on: they may slide and part. "merge" takes away
+            all of their relative velocity so: they stick, and move as one sheet of two sides.
 
     Accuracy: looks follow each other so that sheets come nearer by at most a fifth of the distance
         unseen; new parts pass through the points around (`tests/test_contact.py`); in float32
@@ -122,9 +122,15 @@ def facing(cloud: PointCloud, reach: float) -> Facing:
     return Facing(rows[np.stack([i, j], axis=1)[good]], gap[good], ups[0][good] < 0)
 
 
-def chambers(cloud: PointCloud, neighbors: Neighbors) -> Int[np.ndarray, " n"]:
-    """Which connected part of the surface each point is on, from 0; -1 where it is off."""
-    row, slot = np.nonzero(np.asarray(neighbors.mask))
+def chambers(
+    cloud: PointCloud, neighbors: Neighbors, slots: int | None = None
+) -> Int[np.ndarray, " n"]:
+    """Which connected part of the surface each point is on, from 0; -1 where it is off.
+
+    Connected by lists, or by their first slots: parts of fewer points than a list holds are
+    connected to others by what is farther.
+    """
+    row, slot = np.nonzero(np.asarray(neighbors.mask)[:, :slots])
     found = np.asarray(neighbors.indices)[row, slot]
     graph = coo_array((np.ones(len(row), np.int8), (row, found)), shape=(cloud.n, cloud.n))
     label, on = connected_components(graph, directed=False)[1], cloud.host_active

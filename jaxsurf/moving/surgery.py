@@ -205,19 +205,38 @@ def rejoined(
     """
     cloud = surface.cloud
     found = cut(cloud, surface.neighbors, distance, spacing)
-    if found is None:
-        return surface, fields, None
-    on = np.array(cloud.host_active)
-    on[found.leaving] = False
-    if not on.any():
-        return None, fields, found
-    rows, stays = Rows.of(surface, fields, spacing), np.flatnonzero(on)
-    points = jnp.asarray(found.points, cloud.points.dtype)
-    normals = jnp.asarray(found.normals, cloud.points.dtype)
-    values, wanted = _means(cloud, stays, found.points, (fields, rows.spacing))
-    coming = Rows(points, normals, values, wanted, jnp.zeros(len(points), rows.rank.dtype))
-    after, rows = exchanged(surface, rows, found.leaving, coming, capacity)
-    return after, rows.fields, found
+    if found is not None:
+        on = np.array(cloud.host_active)
+        on[found.leaving] = False
+        if not on.any():
+            return None, fields, found
+        rows, stays = Rows.of(surface, fields, spacing), np.flatnonzero(on)
+        points = jnp.asarray(found.points, cloud.points.dtype)
+        normals = jnp.asarray(found.normals, cloud.points.dtype)
+        values, wanted = _means(cloud, stays, found.points, (fields, rows.spacing))
+        coming = Rows(points, normals, values, wanted, jnp.zeros(len(points), rows.rank.dtype))
+        surface, rows = exchanged(surface, rows, found.leaving, coming, capacity)
+        fields, spacing = rows.fields, np.asarray(rows.spacing)
+    crumbs, parts = _crumbs(surface)
+    if parts:
+        none = np.zeros((0, cloud.dim))
+        found = found or Cut(crumbs, none, none, 0, 0, 0)
+        found = found._replace(vanished=found.vanished + parts)
+        if len(crumbs) == surface.cloud.host_active.sum():
+            return None, fields, found
+        rows = Rows.of(surface, fields, spacing)
+        nothing = jax.tree.map(lambda u: u[:0], rows)
+        surface, rows = exchanged(surface, rows, crumbs, nothing, capacity)
+        fields = rows.fields
+    return surface, fields, found
+
+
+def _crumbs(surface: Discretization) -> tuple[Int[np.ndarray, " m"], int]:
+    """Rows of parts that have fewer points than a stencil asks for, and how many such parts."""
+    dim = surface.cloud.dim
+    part = chambers(surface.cloud, surface.neighbors, 2 * dim + 1)
+    small = np.bincount(part[part >= 0]) < surface.method.neighbor_count(dim)
+    return np.flatnonzero((part >= 0) & small[part]), int(small.sum())
 
 
 def _means(cloud: PointCloud, stays: Int[np.ndarray, " m"], points, values) -> PyTree[Array]:

@@ -110,6 +110,27 @@ def eliminate(
     return Closure(cloud.n, rows, indices, weights, tuple(sources), jnp.asarray(declared))
 
 
+def without_flux(
+    cloud: PointCloud, neighbors: Neighbors, method: AbstractMethod, border: Border
+) -> Closure:
+    r"""$\partial_\nu u = 0$ on the whole border, from arrays that may all be traced.
+
+    As `eliminate`, by the lists given, of which the points on the border are left out.
+    """
+    rows = border.points
+    slots, own = neighbors.indices[rows], rows[:, None]
+    bound = jnp.zeros(cloud.n, bool).at[rows].set(True)
+    near = Rows(slots, neighbors.mask[rows] & (~bound[slots] | (slots == own)), None)
+    gradient, diagnostics = stencil_weights(cloud, near, method, Gradient(), rows)
+    w = jnp.einsum("md,kdm->km", border.conormals(cloud), gradient)
+    if is_concrete(w):
+        names = np.asarray(rows)
+        _check_stencils(names, near, diagnostics.residual, method, cloud.dim)
+        size = np.abs(w).sum(axis=0)
+        check_pivots(w[0], size, names, "value at point {i}: the weight w_i of its derivative")
+    return Closure(cloud.n, rows, slots.T[1:], -w[1:] / w[0], (), bound)
+
+
 def check_parts(cloud, neighbors, border) -> None:
     """Refuse neighbours and borders that are none, or of another cloud."""
     if neighbors is not None:

@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from . import curvature, onesided, operators, quadrature
+from . import curvature, operators, quadrature
 from .arguments import as_float, as_many, finite, instance, switched_off
 from .borders.border import Border
 from .borders.order import find_border
-from .boundary import Closure
 from .build import build, choose_neighbors
 from .cloud import PointCloud
 from .compiling import copying_jit
@@ -126,34 +125,6 @@ class Discretization(eqx.Module):
             (True, True)
         """
         return symmetrised(self.laplacian, self.cloud, self.neighbors, self.cell_areas, self.border)
-
-    @Kept
-    def without_flux(self) -> Closure | None:
-        r"""The condition $\partial_\nu u = 0$ on the whole border, for problems; None without one.
-
-        As `eliminate(cloud, neumann(cloud.boundary))`, but of the neighbours that there are, and
-        also where points are traced: on a surface that moves and whose border gains points.
-
-        Accuracy: as `eliminate`; in float32 filled values are within 2e-5
-            (`tests/test_boundary.py`).
-        Differentiable: forward and reverse, in points and normals, for fixed neighbours.
-        Raises:
-            ValueError: too few neighbours off the border, or such that they do not determine the
-                value there (named by index); on concrete arrays.
-
-        Example:
-            >>> bowl = lambda s: (jnp.sin(s), -jnp.cos(s))
-            >>> surface = js.discretize(js.surface_of_revolution(bowl, 400))
-            >>> heat = js.AdvectionDiffusionReaction(
-            ...     surface.laplacian, closure=surface.without_flux
-            ... )
-            >>> u = js.integrate(heat, surface.cloud.points[:, 0], t1=20.0).ys[-1]
-            >>> bool(jnp.ptp(u) < 1e-3)
-            True
-        """
-        if self.border is None:
-            return None
-        return onesided.without_flux(self.cloud, self.neighbors, self.method, self.border)
 
     @Kept
     def _joint(self) -> tuple[Stencil, Stencil]:

@@ -130,7 +130,9 @@ def numbers_of_points(path: Path, n: int, solution: js.Evolution) -> None:
 
 def run(quick: bool, out: Path) -> list[Row]:
     rows = orders(400 if quick else 4_000)
-    n, times = (400, [0.0, 0.06]) if quick else (4_000, [0.0, 0.09, 0.24, 0.5, 0.55, 0.75, 1.0])
+    n, times = (
+        (400, [0.0, 0.09, 0.24]) if quick else (4_000, [0.0, 0.09, 0.24, 0.5, 0.55, 0.75, 1.0])
+    )
     method = js.GFDM(degree=2)
     solution = adapted(n, method, times)
     for t, cloud in zip(solution.ts[1:], solution.clouds[1:]):

@@ -48,6 +48,10 @@ EXPERIMENTS = {
         "Diffusion over a bump against fine surface finite elements (paper 001, Figs. 5, 6)",
     ),
     "E9": ("e09_rotation", "A quarter of a sphere turns once, three moves (paper 002, Fig. 5)"),
+    "E10": (
+        "e10_hemisphere",
+        "A hemisphere is stretched and pressed, with points added (paper 002, Figs. 6 to 8)",
+    ),
     "E11": ("e11_contact", "Two spheres meet, kept apart or made one (paper 002, Figs. 9, 10)"),
     "E12": (
         "e12_added_points",
@@ -60,6 +64,10 @@ EXPERIMENTS = {
     "E14": (
         "e14_steps",
         "Heat with a source on the expanding sphere, errors of time (paper 002, Table 3)",
+    ),
+    "E15": (
+        "e15_half_pipe",
+        "Diffusion on a half pipe that it inflates and a twist deforms (paper 002, Fig. 13)",
     ),
     "E16": (
         "e16_dumbbell",

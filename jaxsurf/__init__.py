@@ -77,6 +77,7 @@ from .normals import estimate_normals as estimate_normals
 from .normals import from_points as from_points
 from .normals import refit_normals as refit_normals
 from .onesided import eliminate as eliminate
+from .onesided import without_flux as without_flux
 from .operators import biharmonic as biharmonic
 from .operators import diffusion as diffusion
 from .operators import directional_derivative as directional_derivative

@@ -50,13 +50,16 @@ def dominance(weights, residual) -> _Numbers:
     return xp.where(residual < residual_tolerance(weights.dtype), share, -np.inf)
 
 
-def share_wanted(border, share, method: AbstractMethod) -> _Numbers:
-    """What another size must reach at each point, if it is to be better at all.
+def share_wanted(border, share, size, k: int, method: AbstractMethod) -> _Numbers:
+    """What a neighbourhood of this size must reach at each point, if it is to be better at all.
 
-    On a border the usual size stays unless another serves: a one-sided Laplacian has no dominant
-    centre, however large.
+    On a border the usual size k stays unless a larger one serves: a one-sided Laplacian has no
+    dominant centre, however large. One of fewer points has it where these only just determine a
+    polynomial, and no longer do so when they have moved.
     """
-    return namespace(share).where(border & (share > -np.inf), method.least_dominance, -np.inf)
+    xp = namespace(share)
+    least = xp.where(xp.asarray(size < k), np.inf, method.least_dominance)
+    return xp.where(border & (share > -np.inf), least, -np.inf)
 
 
 def is_better(

@@ -202,13 +202,13 @@ def _chosen(cloud, method, throw, needed):
     lists = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
     # Rows last, as weights and diagnostics have them.
     kept = [np.asarray(a)[..., rows] for a in (lists[0].T, lists[1].T, *jax.tree.leaves(found))]
-    wanted = share_wanted(border, share, method)[rows]
     for size in sizes:
         if (best >= method.least_dominance).all():
             break
         some = represented(points, *wide, size, k)
         trial = _in_chunks(cloud, *some, method, rows)
         now = _dominance(*trial)
+        wanted = share_wanted(border[rows], share[rows], size, k, method)
         better = is_better(now, best, wanted, method)
         best = np.where(better, now, best)
         chosen = np.where(better, size, chosen)

@@ -15,6 +15,7 @@ from .boundary import Closure, Source, check_pivots
 from .build import residual_tolerance, stencil_weights
 from .cloud import PointCloud
 from .conditions import Condition, checked_conditions
+from .discretization import Discretization
 from .failures import is_concrete, needs_values, raise_at
 from .neighbors import Neighbors, Rows, nearest_of
 from .stencils.gfdm import GFDM
@@ -108,6 +109,55 @@ def eliminate(
         start += m
     rows, indices, weights = stacked(parts, int(np.argmax(free)), dtype)
     return Closure(cloud.n, rows, indices, weights, tuple(sources), jnp.asarray(declared))
+
+
+def without_flux(surface: Discretization) -> Closure | None:
+    r"""The condition $\partial_\nu u = 0$ on the whole border of a surface, for problems on it.
+
+    As `eliminate(cloud, neumann(cloud.boundary))`, but by the neighbours that the surface has, and
+    also where points are traced: within `evolve`, on a border that moves and gains points.
+
+    Args:
+        surface: from `discretize`.
+
+    Returns:
+        The closure; None of a surface without border.
+
+    Accuracy: as `eliminate`; in float32 filled values are within 2e-5, those of degree 4 within
+        5e-4 (`tests/test_boundary.py`).
+    Differentiable: forward and reverse, in points and normals, for fixed neighbours.
+    Raises:
+        TypeError: no surface.
+        ValueError: on concrete arrays, neighbours off the border that do not determine a value on
+            it (named by index).
+
+    Example:
+        >>> bowl = lambda s: (jnp.sin(s), -jnp.cos(s))
+        >>> surface = js.discretize(js.surface_of_revolution(bowl, 400))
+        >>> closure = js.without_flux(surface)
+        >>> heat = js.AdvectionDiffusionReaction(surface.laplacian, closure=closure)
+        >>> u = js.integrate(heat, surface.cloud.points[:, 0], t1=20.0).ys[-1]
+        >>> bool(jnp.ptp(u) < 1e-3)
+        True
+    """
+    instance(surface, Discretization, "surface", "js.discretize(cloud) makes one")
+    cloud, neighbors, method, border = (
+        surface.cloud, surface.neighbors, surface.method, surface.border
+    )  # fmt: skip
+    if border is None:
+        return None
+    rows = border.points
+    slots, own = neighbors.indices[rows], rows[:, None]
+    bound = jnp.zeros(cloud.n, bool).at[rows].set(True)
+    near = Rows(slots, neighbors.mask[rows] & (~bound[slots] | (slots == own)), None)
+    gradient, diagnostics = stencil_weights(cloud, near, method, Gradient(), rows)
+    w = jnp.einsum("md,kdm->km", border.conormals(cloud), gradient)
+    if is_concrete(w):
+        names = np.asarray(rows)
+        _check_stencils(names, near, diagnostics.residual, method, cloud.dim)
+        size = np.abs(w).sum(axis=0)
+        check_pivots(w[0], size, names, "value at point {i}: the weight w_i of its derivative")
+    return Closure(cloud.n, rows, slots.T[1:], -w[1:] / w[0], (), bound)
 
 
 def check_parts(cloud, neighbors, border) -> None:

@@ -233,7 +233,6 @@ def _adapted(search, grid, rings, cloud, lists, laplacian):
     """Lists of other sizes where the usual one does not serve, and whether there are any."""
     share = dominance(*jax.lax.stop_gradient((laplacian.weights, laplacian.diagnostics.residual)))
     border = jnp.zeros(cloud.n, bool) if cloud.boundary is None else cloud.boundary
-    wanted = share_wanted(border, share, search.method)
     most = max(search.sizes)
 
     def look(rows, _):
@@ -247,7 +246,8 @@ def _adapted(search, grid, rings, cloud, lists, laplacian):
             some = Rows(*of_size(size))
             weights, diagnostics = stencil_weights(cloud, some, search.method, Laplacian(), rows)
             now = dominance(weights, diagnostics.residual)
-            better = is_better(now, best, wanted[rows], search.method)
+            wanted = share_wanted(border[rows], share[rows], size, search.k, search.method)
+            better = is_better(now, best, wanted, search.method)
             return (jnp.where(better, now, best), jnp.where(better, size, chosen)), None
 
         start = (share[rows], jnp.full(len(rows), search.k))

@@ -59,3 +59,22 @@ def test_smaller_and_short_lists_are_whole():
     sizes = np.where(np.arange(N) % 2, WIDE, 12)[:, None]
     both, _ = represented(points, indices, mask, sizes, K)
     np.testing.assert_array_equal(both[1::2], chosen[1::2])
+
+
+def test_borders_have_no_smaller_lists():
+    """Fewer than usual would have a dominant centre there, but no polynomial to spare."""
+    method = js.GFDM(degree=2)
+    lying = js.surface_of_revolution(lambda s: (jnp.cos(s), jnp.sin(s)), 600, interval=(0.0, 1.5))
+    # Stretched along the axis, as what moves is until points are added.
+    wide = jnp.array([1.0, 1.0, 1.5])
+    normals = lying.normals / wide
+    normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+    cloud = js.PointCloud(lying.points * wide, normals, boundary=lying.boundary)
+    usual = method.neighbor_count(3)
+    surface = js.discretize(cloud, method=method)
+    count = np.asarray(surface.neighbors.mask).sum(axis=1)
+    assert count[np.asarray(cloud.boundary)].min() == usual
+    again = surface.moved(cloud.points, cloud.normals, search=surface.search())
+    assert jnp.array_equal(again.neighbors.mask, surface.neighbors.mask)
+    squeezed = surface.moved(surface.cloud.points * jnp.array([1.0, 1.0, 0.8]))
+    assert int(squeezed.code.max()) == 0

@@ -468,6 +468,35 @@ def closed_field(points, normals, value, a, b, conormals, u):
     return jnp.stack([closure(u) for closure in closures])
 
 
+@pytest.mark.parametrize(("method", "single"), [(js.DCPSE(order=2), 2e-5), (js.GFDM(4), 5e-4)])
+def test_a_surface_without_flux_is_closed_as_by_a_condition(method, single):
+    """By the same neighbours; also of traced points, in single precision, and differentiated."""
+    cloud = cap(400)
+    surface = js.discretize(cloud, method=method)
+    u = jnp.cos(2 * cloud.points @ A)
+    given = js.neumann(cloud.boundary)
+    named = js.eliminate(cloud, given, neighbors=surface.neighbors, method=method)
+    np.testing.assert_allclose(js.without_flux(surface)(u), named(u), atol=1e-12)
+    assert jnp.array_equal(js.without_flux(surface).bound, cloud.boundary)
+
+    @eqx.filter_jit
+    def traced(points, u, surface):
+        here = surface.moved(points, cloud.normals.astype(points.dtype))
+        return js.without_flux(here)(u)
+
+    np.testing.assert_allclose(traced(cloud.points, u, surface), named(u), atol=1e-12)
+    narrow = lambda a: a.astype("float32") if a.dtype == float else a
+    found = traced(narrow(cloud.points), narrow(u), jax.tree.map(narrow, surface))
+    np.testing.assert_allclose(found, named(u), atol=single)
+    both = jnp.stack([cloud.points, 1.1 * cloud.points])
+    mapped = jax.vmap(lambda x: traced(x, u, surface))(both)
+    np.testing.assert_allclose(mapped, jnp.stack([named(u)] * 2), atol=1e-9)
+    # Round-off of the weights of degree 4 in differences.
+    square = lambda x: jnp.sum(traced(x, u, surface) ** 2)
+    check_derivative(square, cloud.points, rtol=1e-4)
+    assert js.without_flux(js.discretize(js.sphere(100))) is None
+
+
 def test_derivatives_of_the_closure():
     # In everything at once, and then in each argument: forward mode, reverse mode, differences.
     unit = lambda v: v / jnp.linalg.norm(v, axis=-1, keepdims=True)

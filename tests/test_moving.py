@@ -242,3 +242,25 @@ def test_a_rigid_motion_and_what_is_saved():
     assert solver.startswith("Tsit5")
     back = run(-1.0).clouds[-1].points
     np.testing.assert_allclose(back, CLOUD.points @ half.T, atol=1e-6)
+
+
+def test_heat_stays_within_borders_that_move_with_it():
+    """On a band of a cylinder that heat inflates: r' = phi / 2 with phi r kept, so r² = 1 + t.
+
+    What stands at the border at the start is no heat that there is: nobody looks at it.
+    """
+    band = js.surface_of_revolution(lambda s: (1.0 + 0 * s, s), 600)
+    heat = lambda surface: js.AdvectionDiffusionReaction(
+        surface.laplacian, closure=js.without_flux(surface)
+    )
+    motion = js.Motion(lambda t, surface, phi, args: phi[:, None] * surface.cloud.normals / 2)
+    start = jnp.where(band.boundary, 100.0, 1.0)
+    given = dict(fields=start, problem=heat, method=js.GFDM(degree=2))
+    adapt = js.Adaptation(0.1, capacity=900)
+    run = js.evolve(motion, band, t1=0.5, saveat=[0.0], adapt=adapt, **given)
+    end, phi = run.clouds[-1], run.fields[-1]
+    radius = jnp.linalg.norm(end.points[:, :2], axis=1)
+    assert jnp.abs(radius - 1.5**0.5).max() < 1e-2
+    assert jnp.abs(phi - 1.5**-0.5).max() < 1e-2
+    mass = run.history["mass"]
+    assert abs(mass[1] / mass[0] - 1) < 1e-2

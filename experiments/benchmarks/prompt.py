@@ -311,6 +311,7 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
         lambda m: js.solve(m.laplacian, m.u, closure=m.closure).value,
     ),
     "eliminate": ("open", "conditions", lambda m: js.eliminate(m.cloud, m.conditions)),
+    "without_flux": ("open", "surface", lambda m: js.without_flux(m.surface)),
     "with_ghosts": ("open", "", lambda m: js.with_ghosts(m.cloud, js.neumann(m.cloud.boundary))),
     "solve_nonlinear": (
         "closed",

@@ -89,14 +89,15 @@ class Moving(AbstractEvolution):
     def rate(self, t, u, args):
         points, fields = parted(u)
         surface = self.surface_at(points)
+        problem = None if self.on is None else self.on(surface)
+        fields = fields if problem is None else problem.closed(t, fields)
         velocity = self.motion.velocity(t, surface, fields, args)
         name = f"velocity of {type(self.motion).__name__}"
         velocity = as_float(velocity, name, points.shape).astype(points.dtype)
         if self.faced is not None:
             velocity = self.faced.kept_apart(points, surface.cloud.normals, velocity)
-        if self.on is None:
+        if problem is None:
             return self._free(joined(velocity, jax.tree.map(jnp.zeros_like, fields)))
-        problem = self.on(surface)
         dilution = problem.dilution(fields, surface.divergence(velocity))
         change = problem.rate(t, fields, args)
         return self._free(joined(velocity, jax.tree.map(jnp.add, change, dilution)))
@@ -117,6 +118,9 @@ class Moving(AbstractEvolution):
 
     def rest(self, t, u, args):
         return jax.tree.map(jnp.subtract, self.rate(t, u, args), self.linear(t, u))
+
+    def closed(self, t, u):
+        return joined(u[0], self.fields(t, u))
 
     def fields(self, t, u: PyTree[Array]) -> PyTree[Array]:
         """With their bound values filled in."""

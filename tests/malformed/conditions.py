@@ -176,6 +176,15 @@ CASES = [
              ("conormals", "(3,)", "(1, 3)")),
         ]
     ),
+    # --- without_flux
+    *(
+        Case("without_flux", label, lambda v=v: js.without_flux(v), ("surface", word, "discretize"))
+        for label, v, word in [
+            ("surface is None", None, "None"),
+            ("surface is an array", np.ones((5, 3)), "(5, 3)"),
+            ("surface is a cloud", square(), "PointCloud"),
+        ]
+    ),
     # --- eliminate
     *(
         Case("eliminate", f"conditions: {label}", lambda v=v: js.eliminate(square(), v),

@@ -36,6 +36,12 @@ TESTED = {
         _GRAD,
         _VMAP,
     ),
+    "without_flux": _row(
+        "test_a_surface_without_flux_is_closed_as_by_a_condition",
+        {"surface": _B + "test_a_surface_without_flux_is_closed_as_by_a_condition"},
+        _B + "test_a_surface_without_flux_is_closed_as_by_a_condition",
+        _B + "test_a_surface_without_flux_is_closed_as_by_a_condition",
+    ),
     "Closure": _row(
         "test_the_parts_of_a_closure_agree",
         {"u": _GRAD},

@@ -116,7 +116,10 @@ def _heat_lost(cloud: js.PointCloud, laplacian: js.Stencil, radius: float) -> fl
     if border is not None and border.any():
         closure = js.eliminate(cloud, js.dirichlet(border, jnp.zeros(int(border.sum()))))
     heat = Heat.within(float(size**2 / 100), radius)
-    temperature = diffuse(laplacian, closure, start, heat)
+    try:
+        temperature = diffuse(laplacian, closure, start, heat)
+    except js.IntegrationError:  # complex eigenvalues outside of what the stages are stable for
+        return np.inf
     first, *_, last = np.asarray(temperature @ areas)
     return abs(float(last / first) - 1)
 

@@ -187,7 +187,7 @@ def _chosen(cloud, method, throw, needed):
     neighbors = find_neighbors(cloud, k, throw=throw)
     _check_sizes(cloud, neighbors, method, Laplacian(), throw)
     found = stencil_weights(cloud, neighbors, method, Laplacian())
-    share = _dominance(*found)
+    share = np.asarray(dominance(found[1]))
     poor = np.flatnonzero(on & needed & (share < method.least_dominance))
     sizes = sizes_to_try(method, cloud.dim, k, available)
     border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
@@ -208,7 +208,7 @@ def _chosen(cloud, method, throw, needed):
             break
         some = represented(points, *wide, size, k)
         trial = _in_chunks(cloud, *some, method, rows)
-        now = _dominance(*trial)
+        now = np.asarray(dominance(trial[1]))
         better = is_better(now, best, wanted, method)
         best = np.where(better, now, best)
         chosen = np.where(better, size, chosen)
@@ -248,10 +248,6 @@ def _report(poor, best, border, chosen, method) -> None:
             "may have growing modes (js.spectral_estimate)",
             stacklevel=4,
         )
-
-
-def _dominance(weights, diagnostics) -> np.ndarray:
-    return np.asarray(dominance(np.asarray(weights), np.asarray(diagnostics.residual)))
 
 
 # --- checks --------------------------------------------------------------------------------

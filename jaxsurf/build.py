@@ -26,11 +26,11 @@ from .failures import (
 )
 from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .neighbors import Neighbors, Rows, find_neighbors, nearest_of, switched_on
-from .stencils.dcpse import DCPSE
 from .stencils.gathers import take
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood, weights_by
 from .stencils.stencil import Stencil
 from .stencils.targets import Laplacian
+from .stencils.usual import USUAL
 
 # Stencils that are tried at a time: few shapes are ever compiled.
 _CHUNK = 256
@@ -39,7 +39,7 @@ _CHUNK = 256
 def choose_neighbors(
     cloud: PointCloud,
     *,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
     bound: Bool[Array, " n"] | None = None,
     throw: bool = True,
 ) -> Neighbors:
@@ -88,7 +88,7 @@ def choose_neighbors(
 def build(cloud, neighbors, method, target, throw) -> Stencil:
     """The operator of a target, with neighbours chosen if there are none."""
     instance(cloud, PointCloud, "cloud")
-    instance(method, AbstractMethod, "method", "DCPSE(order=2) or GFDM(degree=4), say")
+    instance(method, AbstractMethod, "method", "GFDM(degree=4) or DCPSE(order=2), say")
     if neighbors is not None:
         instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
         neighbors = switched_on(cloud, neighbors)

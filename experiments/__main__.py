@@ -93,6 +93,10 @@ EXPERIMENTS = {
         "cahn_hilliard",
         "Cahn-Hilliard on a torus: mass, energy, growth of a mode against linear theory",
     ),
+    "choice": (
+        "choice",
+        "Study: which method suits one who does not choose: error, stability, time on ten surfaces",
+    ),
     "conductivity": (
         "conductivity",
         "Inverse: a conductivity field on the bunny from 200 noisy sensors",

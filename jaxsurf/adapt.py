@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .compiling import namespace
-from .stencils.method import AbstractMethod
+from .stencils.method import AbstractMethod, Diagnostics
 from .stencils.targets import Laplacian
 
 # How many of the nearest points make up the neighbourhoods of such points, in units of the usual
@@ -37,17 +37,11 @@ def sizes_to_try(method: AbstractMethod, dim: int, k: int, available: int) -> li
     return sizes if max(sizes, default=0) > k else []
 
 
-def dominance(weights, residual) -> _Numbers:
-    """Share of the centre among the absolute weights of the others; of no use where -inf.
-
-    Args:
-        weights: of the Laplacian, `(k, r)`, that of the centre first.
-        residual: of the moments of each stencil.
-    """
-    xp = namespace(weights)
-    others = xp.sum(xp.abs(weights[1:]), axis=0)
-    share = xp.where(others > 0, -weights[0] / xp.where(others > 0, others, 1), -np.inf)
-    return xp.where(residual < residual_tolerance(weights.dtype), share, -np.inf)
+def dominance(diagnostics: Diagnostics) -> _Numbers:
+    """Share of the centre in the Laplacian's weights; -inf where they are of no use."""
+    share, residual = diagnostics.dominance, diagnostics.residual
+    assert share is not None  # of a Laplacian
+    return namespace(share).where(residual < residual_tolerance(residual.dtype), share, -np.inf)
 
 
 def share_wanted(border, share, size, k: int, method: AbstractMethod) -> _Numbers:

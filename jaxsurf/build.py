@@ -26,11 +26,11 @@ from .failures import (
 )
 from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .neighbors import Neighbors, Rows, find_neighbors, nearest_of, switched_on
-from .stencils.dcpse import DCPSE
 from .stencils.gathers import take
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood, weights_by
 from .stencils.stencil import Stencil
 from .stencils.targets import Laplacian
+from .stencils.usual import USUAL
 
 # Stencils that are tried at a time: few shapes are ever compiled.
 _CHUNK = 256
@@ -39,7 +39,7 @@ _CHUNK = 256
 def choose_neighbors(
     cloud: PointCloud,
     *,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
     bound: Bool[Array, " n"] | None = None,
     throw: bool = True,
 ) -> Neighbors:
@@ -88,7 +88,7 @@ def choose_neighbors(
 def build(cloud, neighbors, method, target, throw) -> Stencil:
     """The operator of a target, with neighbours chosen if there are none."""
     instance(cloud, PointCloud, "cloud")
-    instance(method, AbstractMethod, "method", "DCPSE(order=2) or GFDM(degree=4), say")
+    instance(method, AbstractMethod, "method", "GFDM(degree=4) or DCPSE(order=2), say")
     if neighbors is not None:
         instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
         neighbors = switched_on(cloud, neighbors)
@@ -187,7 +187,7 @@ def _chosen(cloud, method, throw, needed):
     neighbors = find_neighbors(cloud, k, throw=throw)
     _check_sizes(cloud, neighbors, method, Laplacian(), throw)
     found = stencil_weights(cloud, neighbors, method, Laplacian())
-    share = _dominance(*found)
+    share = np.asarray(dominance(found[1]))
     poor = np.flatnonzero(on & needed & (share < method.least_dominance))
     sizes = sizes_to_try(method, cloud.dim, k, available)
     border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
@@ -207,7 +207,7 @@ def _chosen(cloud, method, throw, needed):
             break
         some = represented(points, *wide, size, k)
         trial = _in_chunks(cloud, *some, method, rows)
-        now = _dominance(*trial)
+        now = np.asarray(dominance(trial[1]))
         wanted = share_wanted(border[rows], share[rows], size, k, method)
         better = is_better(now, best, wanted, method)
         best = np.where(better, now, best)
@@ -248,10 +248,6 @@ def _report(poor, best, border, chosen, method) -> None:
             "may have growing modes (js.spectral_estimate)",
             stacklevel=4,
         )
-
-
-def _dominance(weights, diagnostics) -> np.ndarray:
-    return np.asarray(dominance(np.asarray(weights), np.asarray(diagnostics.residual)))
 
 
 # --- checks --------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from tqdm import tqdm
 import jaxsurf as js
 
 from . import demo
+from .stencils.usual import USUAL
 
 _METHODS = {
     "dcpse2": js.DCPSE(order=2),
@@ -51,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with _progress(len(demo.STAGES)) as tell:
             result = demo.run(
                 sample,
-                method=_METHODS[options.method or _usual(options.surface)],
+                method=_METHODS[options.method],
                 out=options.out,
                 until=options.time,
                 tell=tell,
@@ -61,14 +62,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     print("\n".join(report(result)))
     return 0 if demo.healthy(result) else 1
-
-
-def _usual(surface: str | None) -> str:
-    """GFDM(4), but on scans coarser than their texture heat may grow with it, as on an armadillo.
-
-    There order 4 gains nothing over 2 and takes several times as long.
-    """
-    return "gfdm4" if surface is None else "dcpse2"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -110,8 +103,8 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument(
         "--method",
         choices=_METHODS,
-        help="surface DC-PSE of order 2 or 4, or GFDM of degree 2 or 4 (default: gfdm4 for the "
-        "built-in surface, dcpse2 for files)",
+        default=next(name for name, method in _METHODS.items() if method == USUAL),
+        help="surface DC-PSE of order 2 or 4, or GFDM of degree 2 or 4 (default: %(default)s)",
     )
     return parser
 

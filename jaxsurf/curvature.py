@@ -15,15 +15,15 @@ from .compiling import sized_jit
 from .frames import frames_of
 from .neighbors import Neighbors, switched_on
 from .operators import laplace_beltrami, surface_gradient
-from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod
+from .stencils.usual import USUAL
 
 
 def shape_tensor(
     cloud: PointCloud,
     neighbors: Neighbors | None = None,
     *,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
 ) -> Float[Array, "n d d"]:
     r"""Shape tensor $\nabla_S n$ in the coordinates of space (Singh et al. 2023, Section 4.3).
 
@@ -68,7 +68,7 @@ def mean_curvature(
     cloud: PointCloud,
     neighbors: Neighbors | None = None,
     *,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
 ) -> Float[Array, " n"]:
     r"""Mean curvature $H = \tfrac{1}{d-1} \nabla_S\cdot n$: half the trace of the shape tensor.
 
@@ -104,7 +104,7 @@ def gauss_curvature(
     cloud: PointCloud,
     neighbors: Neighbors | None = None,
     *,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
 ) -> Float[Array, " n"]:
     r"""Gauss curvature, the product of the principal curvatures.
 
@@ -138,7 +138,7 @@ def principal_curvatures(
     cloud: PointCloud,
     neighbors: Neighbors | None = None,
     *,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
 ) -> tuple[Float[Array, "n 2"], Float[Array, "n 2 3"]]:
     r"""Principal curvatures and directions: eigenvalues and eigenvectors of the shape tensor.
 
@@ -184,7 +184,7 @@ def mean_curvature_vector(
     cloud: PointCloud,
     neighbors: Neighbors | None = None,
     *,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
 ) -> Float[Array, "n d"]:
     r"""Mean curvature vector $\Delta_S x = -(d-1) H n$, the Laplacian of the positions.
 

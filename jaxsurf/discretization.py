@@ -22,10 +22,10 @@ from .motion import CODES, folded, judged, moved_cloud, unreached
 from .neighbors import Neighbors, switched_on
 from .renew import NeighborSearch, renewed
 from .stencils.algebra import Composition
-from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil
 from .stencils.targets import Gradient, Joint, Laplacian
+from .stencils.usual import USUAL
 from .symmetric import symmetrised
 
 
@@ -350,7 +350,7 @@ def discretize(
     cloud: PointCloud,
     neighbors: Neighbors | None = None,
     *,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
 ) -> Discretization:
     r"""A surface that can be calculated with: a cloud, its neighbours and a method.
 
@@ -379,7 +379,7 @@ def discretize(
         True
     """
     instance(cloud, PointCloud, "cloud")
-    instance(method, AbstractMethod, "method", "DCPSE(order=2) or GFDM(degree=4), say")
+    instance(method, AbstractMethod, "method", "GFDM(degree=4) or DCPSE(order=2), say")
     if neighbors is None:
         neighbors = choose_neighbors(cloud, method=method)
     instance(neighbors, Neighbors, "neighbors", "see find_neighbors")

@@ -29,15 +29,15 @@ from .compiling import at_once
 from .conditions import Condition, checked_conditions
 from .failures import is_concrete, needs_values, raise_at
 from .images import apart, reach_of, reflected
-from .stencils.dcpse import DCPSE
 from .stencils.method import AbstractMethod
+from .stencils.usual import USUAL
 
 
 def with_ghosts(
     cloud: PointCloud,
     conditions: Condition | Sequence[Condition],
     *,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
     depth: float | None = None,
     border: Border | None = None,
     throw: bool = True,

@@ -15,18 +15,19 @@ from .cloud import PointCloud
 from .failures import is_concrete, refuse, without_derivatives
 from .neighbors import Neighbors, find_neighbors
 from .stencils.algebra import Composition
-from .stencils.dcpse import DCPSE, FlatDCPSE
+from .stencils.dcpse import FlatDCPSE
 from .stencils.gathers import take
 from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil
 from .stencils.targets import Gradient, Hessian, Laplacian, Partial
+from .stencils.usual import USUAL
 
 
 def laplace_beltrami(
     cloud: PointCloud,
     neighbors: Neighbors | None = None,
     *,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
     throw: bool = True,
 ) -> Stencil:
     r"""Laplace–Beltrami operator of a point-cloud surface.
@@ -70,7 +71,7 @@ def surface_gradient(
     cloud: PointCloud,
     neighbors: Neighbors | None = None,
     *,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
     throw: bool = True,
 ) -> Stencil:
     r"""Gradient along the surface, $\nabla_S u$, as a vector in space.
@@ -105,7 +106,7 @@ def surface_divergence(
     cloud: PointCloud,
     neighbors: Neighbors | None = None,
     *,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
     throw: bool = True,
 ) -> Stencil:
     r"""Divergence along the surface, $\nabla_S \cdot v = \sum_a (\nabla_S v_a)_a$.
@@ -143,7 +144,7 @@ def directional_derivative(
     direction: Float[Array, "*n d"],
     *,
     neighbors: Neighbors | None = None,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
     throw: bool = True,
 ) -> Stencil:
     r"""Derivative $a \cdot \nabla_S u$ along a vector field a; its normal part does not count.
@@ -185,7 +186,7 @@ def diffusion(
     diffusivity: Float[Array, "*n"],
     *,
     neighbors: Neighbors | None = None,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
     throw: bool = True,
 ) -> Stencil:
     r"""Diffusion in an inhomogeneous or anisotropic medium, $\nabla_S\cdot(D\,\nabla_S u)$.
@@ -282,7 +283,7 @@ def biharmonic(
     cloud: PointCloud,
     neighbors: Neighbors | None = None,
     *,
-    method: AbstractMethod = DCPSE(order=4),
+    method: AbstractMethod = USUAL,
     throw: bool = True,
 ) -> Composition:
     r"""Bi-Laplacian $\Delta_S^2$, the Laplace–Beltrami operator applied twice.

@@ -231,7 +231,7 @@ def _apart(search, grid, rings, found, lists) -> _Lists:
 
 def _adapted(search, grid, rings, cloud, lists, laplacian):
     """Lists of other sizes where the usual one does not serve, and whether there are any."""
-    share = dominance(*jax.lax.stop_gradient((laplacian.weights, laplacian.diagnostics.residual)))
+    share = dominance(laplacian.diagnostics)
     border = jnp.zeros(cloud.n, bool) if cloud.boundary is None else cloud.boundary
     most = max(search.sizes)
 
@@ -244,8 +244,7 @@ def _adapted(search, grid, rings, cloud, lists, laplacian):
         def trial(best_so_far, size):
             best, chosen = best_so_far
             some = Rows(*of_size(size))
-            weights, diagnostics = stencil_weights(cloud, some, search.method, Laplacian(), rows)
-            now = dominance(weights, diagnostics.residual)
+            now = dominance(stencil_weights(cloud, some, search.method, Laplacian(), rows)[1])
             wanted = share_wanted(border[rows], share[rows], size, search.k, search.method)
             better = is_better(now, best, wanted, search.method)
             return (jnp.where(better, now, best), jnp.where(better, size, chosen)), None

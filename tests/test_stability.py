@@ -65,3 +65,23 @@ def test_folds_of_a_scan_get_smaller_neighborhoods():
     usual = method.neighbor_count(3)
     assert counts.min() < usual == counts.max()
     assert spectrum.abscissa < 1e-6 * spectrum.radius
+
+
+def test_folds_that_no_neighbourhood_serves_get_positive_weights():
+    """A dozen of rows in the folds of the Armadillo gave it modes that grow."""
+    try:
+        cloud = data.armadillo(10_000)
+    except FileNotFoundError as error:
+        pytest.skip(str(error))
+    method = js.GFDM(degree=4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # it bends within one stencil
+        operator = js.laplace_beltrami(cloud, method=method)
+    told, weights = operator.diagnostics, np.asarray(operator.weights)
+    folds = np.asarray((told.dominance < method.least_dominance) & (told.tube > 1))
+    assert 0 < folds.sum() < 0.005 * cloud.n
+    assert (weights[1:, folds] >= 0).all()
+    squared = np.sum((cloud.points[operator.indices] - cloud.points) ** 2, axis=2)
+    np.testing.assert_allclose((weights * squared).sum(axis=0)[folds], 4, rtol=1e-9)
+    spectrum = js.spectral_estimate(operator)
+    assert spectrum.abscissa < 1e-8 * spectrum.radius

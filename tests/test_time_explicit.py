@@ -11,8 +11,9 @@ import jaxsurf as js
 from jaxsurf.time.chebyshev import table
 
 CLOUD = js.sphere(300)
-NEIGHBORS = js.choose_neighbors(CLOUD)
-LAPLACIAN = js.laplace_beltrami(CLOUD, NEIGHBORS)
+METHOD = js.DCPSE(order=2)
+NEIGHBORS = js.choose_neighbors(CLOUD, method=METHOD)
+LAPLACIAN = js.laplace_beltrami(CLOUD, NEIGHBORS, method=METHOD)
 RADIUS = js.spectral_estimate(LAPLACIAN).radius
 
 

@@ -18,8 +18,8 @@ from ..discretization import Discretization, discretize
 from ..failures import is_concrete, raise_at, refuse
 from ..kept import Kept
 from ..motion import CODES
-from ..stencils.dcpse import DCPSE
 from ..stencils.method import AbstractMethod
+from ..stencils.usual import USUAL
 from ..time.asked import check_coefficients
 from ..time.checkpoint import Checkpoint
 from ..time.integrate import integrate
@@ -136,7 +136,7 @@ def evolve(
             `lambda surface: js.AdvectionDiffusionReaction(surface.laplacian)`. What it conserves is
             diluted as the surface grows; of a `WaveEquation` that is $\partial_t u$. If None,
             fields go with the points unchanged.
-        method: of the operators; `DCPSE(order=2)` if None, or that of a surface given.
+        method: of the operators; `GFDM(degree=4)` if None, or that of a surface given.
         saveat: times to save; t1 is always saved.
         solver, dt0, rtol, atol: as for `integrate`; the solver that suits motion and problem if
             None.
@@ -218,7 +218,7 @@ def _discretized(motion, cloud, method) -> Discretization:
             raise ValueError(f"method = {method!r}, but the surface given has {cloud.method!r}")
         return cloud
     instance(cloud, PointCloud, "cloud", "js.PointCloud(points, normals), or js.discretize(cloud)")
-    return discretize(cloud, method=DCPSE(order=2) if method is None else method)
+    return discretize(cloud, method=USUAL if method is None else method)
 
 
 def _with_rows(

@@ -64,7 +64,8 @@ def exchanged(
     held = surface.border is not None
     marked = jnp.asarray((np.asarray(rows.rank) > 0) & on) if held else None
     cloud = PointCloud(rows.points, rows.normals, active=jnp.asarray(on), boundary=marked)
-    neighbors = find_neighbors(cloud, surface.method.neighbor_count(cloud.dim))
+    k = min(surface.method.neighbor_count(cloud.dim), int(on.sum()))
+    neighbors = find_neighbors(cloud, k)
     neighbors = _widened(neighbors, surface.neighbors.k)
     border = find_border(cloud) if held else None
     return Discretization(cloud, neighbors, surface.method, border), rows

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ..arguments import as_float, real, whole
+from ..fits.kernels import gaussian
 from ..fits.monomials import polynomial_count
 from ..fits.plane import Neighborhood, dot
-from .targets import AbstractTarget
+from .targets import AbstractTarget, Joint, Laplacian
 
 
 class Diagnostics(eqx.Module):
@@ -27,6 +28,10 @@ class Diagnostics(eqx.Module):
         tube: support radius times the largest normal curvature seen within it. Above 1 the
             tube of that radius around the surface intersects itself: copies along the normals
             cross, and the surface is no graph over the tangent plane.
+        dominance: share of the centre among the absolute weights of the others, in the Laplacian
+            that the method makes; -inf where there are no others. Where it is less than
+            `least_dominance` and `tube` above 1, the Laplacian has positive weights instead. None
+            for other operators.
 
     Example:
         >>> found = js.laplace_beltrami(js.sphere(300)).diagnostics
@@ -40,6 +45,7 @@ class Diagnostics(eqx.Module):
     support: Float[Array, "*n"]
     layers: Int[Array, "*n"]
     tube: Float[Array, "*n"]
+    dominance: Float[Array, "*n"] | None = None
 
     @classmethod
     def of(cls, around: Neighborhood, condition, residual, support, layers: int) -> Diagnostics:
@@ -120,7 +126,41 @@ def weights_by(
     values = as_float(found[0], name)
     if values.shape[values.ndim - len(want) :] != want:
         raise ValueError(f"{name} has shape {values.shape}, expected (*components, {str(want)[1:]}")
+    if isinstance(target, Laplacian):
+        return _calmed(method, around, values, found[1])
+    if isinstance(target, Joint) and isinstance(target.targets[0], Laplacian):
+        laplacian, diagnostics = _calmed(method, around, values[0], found[1])
+        return values.at[0].set(laplacian), diagnostics
     return values, found[1]
+
+
+def _calmed(method: AbstractMethod, around: Neighborhood, weights, diagnostics: Diagnostics):
+    """The Laplacian's weights, positive where the surface bends and the centre is not dominant.
+
+    There no polynomial is of use, and a few such rows give an operator growing modes. Weights of
+    one sign are inaccurate, but let nothing grow.
+    """
+    others = jnp.sum(jnp.abs(weights[1:]), axis=0)
+    share = jnp.where(others > 0, -weights[0] / jnp.where(others > 0, others, 1), -jnp.inf)
+    share = jax.lax.stop_gradient(share)
+    wild = (share < method.least_dominance) & (diagnostics.tube > 1)
+    diagnostics = eqx.tree_at(
+        lambda d: d.dominance, diagnostics, share, is_leaf=lambda leaf: leaf is None
+    )
+    return jnp.where(wild, _positive(around, diagnostics.support), weights), diagnostics
+
+
+# Length of the kernel of positive weights in units of the support: about one spacing.
+_NEAR = 0.3
+
+
+def _positive(around: Neighborhood, support) -> Float[Array, "k *p"]:
+    """Multiples of a kernel that give the squared distance the Laplacian it has in the plane."""
+    r2, flat = around.squared, around.offsets.shape[1] - 1
+    kernel = gaussian(r2, _NEAR * support, support, around.mask)
+    second = jnp.sum(kernel * r2, axis=0)
+    eta = 2 * flat * kernel / jnp.where(second > 0, second, 1)
+    return with_center(eta[None])[0]
 
 
 def check_positive(method: AbstractMethod, **least: bool) -> None:

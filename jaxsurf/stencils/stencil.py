@@ -191,7 +191,8 @@ class Stencil(AbstractOperator):
             "in_shape": np.array(self.in_shape, int),
         }
         if self.diagnostics is not None:
-            data |= {name: np.asarray(value) for name, value in vars(self.diagnostics).items()}
+            known = vars(self.diagnostics).items()
+            data |= {name: np.asarray(value) for name, value in known if value is not None}
         marks = {"border": self.border, "active": self.active}
         data |= {name: np.asarray(mark) for name, mark in marks.items() if mark is not None}
         with open(path, "wb") as file:

@@ -12,10 +12,10 @@ from ..neighbors import Neighbors, find_neighbors, switched_on
 from ..operators import diffusion
 from ..spectrum import spectral_estimate
 from ..stencils.algebra import AbstractOperator
-from ..stencils.dcpse import DCPSE
 from ..stencils.gathers import take
 from ..stencils.method import AbstractMethod
 from ..stencils.stencil import Stencil
+from ..stencils.usual import USUAL
 from .coefficients import check_operator
 
 
@@ -78,7 +78,7 @@ def upwind_viscosity(
     velocity: Float[Array, "n d"],
     *,
     neighbors: Neighbors | None = None,
-    method: AbstractMethod = DCPSE(order=2),
+    method: AbstractMethod = USUAL,
     strength: float = 1.0,
 ) -> Stencil:
     r"""The viscosity of upwind differences, of first order.
@@ -112,7 +112,7 @@ def upwind_viscosity(
         True
     """
     instance(cloud, PointCloud, "cloud")
-    instance(method, AbstractMethod, "method", "like js.DCPSE(order=2)")
+    instance(method, AbstractMethod, "method", "like js.GFDM(degree=4)")
     velocity = as_float(velocity, "velocity", cloud.points.shape)
     velocity = switched_off(cloud.active, finite(velocity, "velocity", cloud.active))
     real(strength, "strength", least=0)

@@ -280,7 +280,8 @@ def _check(stencil: Stencil, neighbors, method, target, dim) -> None:
         warnings.warn(
             f"the surface bends within one stencil: support x curvature = {tube[i]:.2f} at point "
             f"{i} ({int(np.sum(tube > 1))} points above 1). Use more points there or a smaller "
-            "support",
+            "support; js.discretize(cloud, method=...).expected_error tells what it makes of the "
+            "Laplacian",
             stacklevel=4,
         )
 

@@ -168,6 +168,31 @@ class Discretization(eqx.Module):
         curvature.check_surface(self.cloud)
         return curvature.principal_of(*curvature.along_tangents(self.shape_tensor, self.cloud))
 
+    @property
+    def expected_error(self) -> Float[Array, ""]:
+        r"""Relative error to expect of the Laplacian, of fields as smooth as the surface.
+
+        $\|\Delta_S x + (d - 1) H n\| / \|\Delta_S x\|$ over all points: what the Laplacian makes of
+        the positions beside what the gradient makes of the normals. A few per cent: more points.
+
+        Accuracy: between a fifth and four times the error of fields that vary as fast, on smooth,
+            coarse and random points (`tests/test_accuracy.py`). Of normals that are wrong it tells
+            too. A plane has none but round-off.
+        Differentiable: forward and reverse, in points and normals.
+
+        Example:
+            >>> coarse, fine = (js.discretize(js.sphere(n)) for n in (200, 2_000))
+            >>> bool(coarse.expected_error > 30 * fine.expected_error > 0)
+            True
+        """
+        cloud = self.cloud.seen
+        bent = (cloud.dim - 1) * self.mean_curvature[:, None] * cloud.normals
+        norm = lambda v: jnp.sqrt(jnp.sum(switched_off(self.cloud.active, v) ** 2))
+        # A plane has no curvature: there round-off is told in units of the size.
+        least = norm(jnp.ones(cloud.n) / jnp.ptp(cloud.points))
+        error = norm(self.laplacian(cloud.points) + bent)
+        return error / jnp.maximum(norm(bent), least)
+
     # --- integrals -------------------------------------------------------------------------
 
     @Kept

@@ -212,6 +212,7 @@ def discretized(c: Case):
         "diffusion": s.diffusion(c.field(1 + smooth(c.x) ** 2))(c.u),
         "shape": s.shape_tensor,
         "mean curvature": s.mean_curvature,
+        "expected error": s.expected_error,
         "gauss": s.gauss_curvature,
         "principal": s.principal_curvatures,
         "moved": moved.laplacian(c.u),

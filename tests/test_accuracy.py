@@ -6,7 +6,13 @@ import pytest
 
 import jaxsurf as js
 
-from .helpers import exponential, jittered_sphere, relative_error
+from .helpers import (
+    check_derivatives,
+    exponential,
+    jittered_sphere,
+    random_sphere,
+    relative_error,
+)
 
 
 def error(cloud, method):
@@ -111,3 +117,36 @@ def test_layers_of_the_papers_default():
         errors[order] = [relative_error(operator(u), exact) for operator in (ours, theirs)]
     assert errors[2][1] < 1.1 * errors[2][0] < 1.3e-2
     assert errors[4][0] < 2e-4 and errors[4][1] > 0.1
+
+
+@pytest.mark.parametrize("method", [js.GFDM(degree=2), js.GFDM(degree=4)], ids=str)
+@pytest.mark.parametrize("points", [random_sphere, jittered_sphere], ids=["random", "jittered"])
+def test_expected_error_is_near_the_error(points, method):
+    """Of 300 and 1,500 points, on which they differ by factors; on a plane it is round-off."""
+    expected, seen = [], []
+    for n in (300, 1_500):
+        surface = js.discretize(points(n), method=method)
+        u, _, exact = exponential(surface.cloud.points)
+        expected.append(float(surface.expected_error))
+        seen.append(relative_error(surface.laplacian(u), exact))
+    ratio = np.array(expected) / np.array(seen)
+    assert np.all((ratio > 0.2) & (ratio < 4)), (expected, seen)
+    assert expected[1] < expected[0] / 3
+
+
+def test_derivatives_of_the_expected_error():
+    cloud, method = jittered_sphere(150), js.GFDM(degree=2)
+    neighbors = js.find_neighbors(cloud, method.neighbor_count(3))
+
+    def expected(points, normals):
+        cloud = js.PointCloud(points, normals / jnp.linalg.norm(normals, axis=1, keepdims=True))
+        return js.discretize(cloud, neighbors, method=method).expected_error
+
+    check_derivatives(expected, cloud.points, cloud.normals)
+
+
+def test_expected_error_of_a_plane_in_units_of_its_size():
+    flat = np.stack(np.meshgrid(*(np.linspace(0, 1e-3, 15),) * 2), axis=2).reshape(-1, 2)
+    cloud = js.PointCloud(np.c_[flat, 0 * flat[:, 0]], np.tile([[0.0, 0, 1]], (225, 1)))
+    surface = js.discretize(cloud, method=js.GFDM(degree=2))
+    assert surface.expected_error < 1e-9

@@ -407,6 +407,10 @@ def preconditioned(c: Case, make):
 # With a border.
 
 
+def unflowing(c: Case):
+    return {"values": js.without_flux(c.surface)(c.u)[c.rows]}
+
+
 def bounded(c: Case, kind=js.eliminate):
     border = c.cloud.boundary & c.cloud.host_active
     x = np.asarray(c.cloud.points)[np.asarray(border)]
@@ -553,6 +557,7 @@ TABLE = {
     "Checkpoint": Row(parted, LOOSE),
     "steady_state": Row(stilled, LOOSE),
     "eliminate": Row(closed, SOLVED, open=True),
+    "without_flux": Row(unflowing, open=True),
     "with_ghosts": Row(mirrored, SOLVED, open=True),
     "find_border": Row(marked, open=True),
     "Discretization": Row(shore, open=True),

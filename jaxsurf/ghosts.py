@@ -67,8 +67,8 @@ def with_ghosts(
     Accuracy: images are off by O(h³) (Neumann, Robin with b ≠ 0) and O(h²) (Dirichlet), so that
     solutions converge with second order whatever the method (`tests/test_boundary.py`); exact
     to the method's order only where the solution itself has the symmetry. In float32 images are
-    within 3e-5 of their places and extended values within 1e-4 of their size and 2e-4
-    (`tests/test_boundary.py`).
+    within 3e-5 of their places with `DCPSE(order=2)`, and extended values within 1e-4 of their
+    size and 2e-4 (`tests/test_boundary.py`).
     Differentiable: in values, a and b; not in the points, whose images are found on the host.
     Raises:
         ValueError: as `eliminate` and `find_border`; a Neumann or Robin condition off the border;

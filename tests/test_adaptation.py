@@ -150,6 +150,19 @@ def test_points_are_added_while_a_sphere_grows(tmp_path, monkeypatch):
         np.testing.assert_array_equal(one.points, other.points)
 
 
+@pytest.mark.slow
+def test_no_step_goes_far_beyond_what_the_points_serve():
+    """Steps as long as tolerances allow: the first would have doubled the sphere and more."""
+    grow = js.Motion(lambda t, surface, fields, args: surface.cloud.points)
+    adapt = js.Adaptation(np.sqrt(4 * np.pi / 300), capacity=2_000)
+    given = dict(method=js.GFDM(degree=2), rtol=0.1, atol=0.1, dt0=1.0)
+    run = js.evolve(grow, js.sphere(300), t1=1.0, adapt=adapt, **given)
+    events = run.history["events"]
+    times = np.r_[0.0, events["t"]]
+    assert np.diff(times[:2]).max() < 2 * np.log(follow._STRETCH) + 1e-9
+    assert events["added"].sum() > 1_000 and run.stats["refused"] > 0
+
+
 def test_in_single_precision():
     sphere = js.sphere(200)
     x = sphere.points.astype(jnp.float32)

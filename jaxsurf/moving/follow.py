@@ -28,7 +28,8 @@ from .contact import Contact, watched
 from .problem import Moving, joined, parted
 from .surgery import rejoined
 
-# Points are added and merged where neighbourhoods have grown or shrunk by this factor.
+# Points are added and merged where neighbourhoods have grown or shrunk by this factor, and a step
+# that has taken them past its square is taken again, in parts.
 _STRETCH = 1.15
 # Lists are found anew once points outside may come as near as this share of the farthest in them.
 _WORN = 0.75
@@ -217,7 +218,11 @@ class _Run:
             )
             self.solver = solution.stats["solver"]
             left = reached - self.t > _LEAST * (target - self.t)
-            if left and (jnp.any(unreached(start, new[0], neighbors)) or self.may_cross(new[0])):
+            if left and (
+                jnp.any(unreached(start, new[0], neighbors))
+                or self.may_cross(new[0])
+                or (uneven and jnp.any(_uneven(start, new[0], neighbors, _STRETCH**2)))
+            ):
                 # The last step went farther than the neighbours serve: half of the way first.
                 end = self.t + (reached - self.t) / 2
                 self.count(0, steps + refused, 0)
@@ -326,6 +331,11 @@ class _Worn(eqx.Module):
         if self.free is not None:
             worn = worn | (jnp.sum((y[0] - self.points) ** 2, axis=1) > self.free**2)
         if self.uneven:
-            growth = stretch(self.points, y[0], self.neighbors)
-            worn = worn | (growth > _STRETCH) | (growth < 1 / _STRETCH)
+            worn = worn | _uneven(self.points, y[0], self.neighbors, _STRETCH)
         return jnp.any(worn)
+
+
+def _uneven(before, after, neighbors: Neighbors, factor: float) -> Bool[Array, " n"]:
+    """Where neighbourhoods have grown or shrunk by more than a factor."""
+    growth = stretch(before, after, neighbors)
+    return (growth > factor) | (growth < 1 / factor)

@@ -76,18 +76,21 @@ class Evolution(eqx.Module):
         return [surface.cloud for surface in self.surfaces]
 
     @property
+    def events(self) -> dict[str, Float[np.ndarray, " e"]]:
+        """When, "t", points were "added" and pairs "merged", necks "pinched", gaps "joined", parts
+        "vanished", and how many of each; empty without adaptation."""
+        return {} if self.changes is None else dict(zip(_EVENTS, self.changes.T))
+
+    @property
     def history(self) -> dict[str, Any]:
         r"""Number of points, area, enclosed volume and integrals of the fields at each time.
 
-        The volume is $\\tfrac1d\\int x\\cdot n$, of closed surfaces. With adaptation also "events":
-        when how many points were "added" and pairs "merged", and how many necks were "pinched",
-        gaps "joined" and parts "vanished" by contact. Raises what `areas` does.
+        The volume is $\\tfrac1d\\int x\\cdot n$, of closed surfaces. With adaptation also `events`.
+        Raises what `areas` does.
         """
         rows = [_measured(*row) for row in self.rows]
         history = {"t": self.ts} | jax.tree.map(lambda *values: jnp.stack(values), *rows)
-        if self.changes is not None:
-            history["events"] = dict(zip(_EVENTS, self.changes.T))
-        return history
+        return history if self.changes is None else history | {"events": self.events}
 
     def __repr__(self):
         if not is_concrete(self.ts):

@@ -44,15 +44,15 @@ def dominance(diagnostics: Diagnostics) -> _Numbers:
     return namespace(share).where(residual < residual_tolerance(residual.dtype), share, -np.inf)
 
 
-def share_wanted(border, share, size, k: int, method: AbstractMethod) -> _Numbers:
+def share_wanted(border, share, size, fewest: int, method: AbstractMethod) -> _Numbers:
     """What a neighbourhood of this size must reach at each point, if it is to be better at all.
 
-    On a border the usual size k stays unless a larger one serves: a one-sided Laplacian has no
-    dominant centre, however large. One of fewer points has it where these only just determine a
-    polynomial, and no longer do so when they have moved.
+    On a border the usual size stays unless another serves, of the fewest points that are allowed
+    there or more: a one-sided Laplacian has no dominant centre, however large. Fewer than usual may
+    only just determine a polynomial, and no longer do so when they have moved.
     """
     xp = namespace(share)
-    least = xp.where(xp.asarray(size < k), np.inf, method.least_dominance)
+    least = xp.where(xp.asarray(size < fewest), np.inf, method.least_dominance)
     return xp.where(border & (share > -np.inf), least, -np.inf)
 
 

@@ -85,6 +85,14 @@ def choose_neighbors(
     return Neighbors(neighbors.indices, jnp.asarray(mask), neighbors.radius)
 
 
+def choose_fewer_neighbors(cloud: PointCloud, method: AbstractMethod) -> Neighbors:
+    """As `choose_neighbors`, but also fewer than usual on borders if their centre then dominates.
+
+    For surfaces at rest; the Laplacian there is more accurate and has fewer negative weights.
+    """
+    return _adapted(cloud, method, True, fewest=0)[0]
+
+
 def build(cloud, neighbors, method, target, throw) -> Stencil:
     """The operator of a target, with neighbours chosen if there are none."""
     instance(cloud, PointCloud, "cloud")
@@ -171,15 +179,15 @@ def rows_of(weights, others, count: int):
 # --- neighbourhoods ------------------------------------------------------------------------
 
 
-def _adapted(cloud, method, throw, needed=True):
+def _adapted(cloud, method, throw, needed=True, fewest=None):
     """Neighbours that suit the method, and the Laplacian's weights and diagnostics with them."""
     cloud = without_derivatives(cloud)
     needs_values("cloud", cloud, instead="under jit and vmap pass the neighbours")
     with at_once():  # also within something that is traced
-        return _chosen(cloud, method, throw, needed)
+        return _chosen(cloud, method, throw, needed, fewest)
 
 
-def _chosen(cloud, method, throw, needed):
+def _chosen(cloud, method, throw, needed, fewest):
     on = cloud.host_active
     available = int(on.sum())
     count = whole(method.neighbor_count(cloud.dim), f"neighbor_count of {method}", least=1)
@@ -189,7 +197,7 @@ def _chosen(cloud, method, throw, needed):
     found = stencil_weights(cloud, neighbors, method, Laplacian())
     share = np.asarray(dominance(found[1]))
     poor = np.flatnonzero(on & needed & (share < method.least_dominance))
-    sizes = sizes_to_try(method, cloud.dim, k, available)
+    sizes, fewest = sizes_to_try(method, cloud.dim, k, available), k if fewest is None else fewest
     border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
     if not poor.size or not sizes:
         _report(poor, share[poor], border, np.full(poor.size, k), method)
@@ -208,7 +216,7 @@ def _chosen(cloud, method, throw, needed):
         some = represented(points, *wide, size, k)
         trial = _in_chunks(cloud, *some, method, rows)
         now = np.asarray(dominance(trial[1]))
-        wanted = share_wanted(border[rows], share[rows], size, k, method)
+        wanted = share_wanted(border[rows], share[rows], size, fewest, method)
         better = is_better(now, best, wanted, method)
         best = np.where(better, now, best)
         chosen = np.where(better, size, chosen)

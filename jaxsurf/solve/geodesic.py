@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..arguments import instance, real, within_round_off
-from ..build import choose_neighbors
+from ..build import choose_fewer_neighbors
 from ..cloud import PointCloud
 from ..compiling import at_once, sized_jit
 from ..discretization import Discretization
@@ -60,7 +60,7 @@ def geodesic_distance(
     Args:
         cloud: n points with unit normals; borders need no conditions.
         sources: a mask, or indices; concrete.
-        neighbors: lists, concrete; if None as many as `method` asks for, more of them
+        neighbors: lists, concrete; if None as many as `method` asks for, other numbers
             along borders (host only).
         method: of the Laplacian and the gradient; of second order, as heat has to stay positive.
         smoothing: s, in units of the spacing h. More of it rounds the distance off where fronts
@@ -282,7 +282,7 @@ def _bent(chord, turn):
 
 
 def _neighbors(cloud, method) -> Neighbors:
-    """The usual ones, as a Laplacian that does not suit heat is replaced; larger ones at borders.
+    """The usual ones, as a Laplacian that does not suit heat is replaced; others at borders.
 
     There distances are twice as wrong without them. A border is seen by neighbours that lie to one
     side: those of a straight one have their mean 0.6 of their mean square away.
@@ -298,7 +298,7 @@ def _neighbors(cloud, method) -> Neighbors:
         one_sided &= (marked & mask[:, :, 0]).any(axis=1)
     if not one_sided.any():
         return neighbors
-    chosen, rows = choose_neighbors(cloud, method=method), one_sided[:, None]
+    chosen, rows = choose_fewer_neighbors(cloud, method), one_sided[:, None]
     indices = jnp.where(rows, chosen.indices, neighbors.indices)
     return Neighbors(indices, jnp.where(rows, chosen.mask, neighbors.mask))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -98,15 +99,14 @@ def followed(
         now = now._replace(place=run.place, changes=run.changes)
     saved = list(now.saved)
     with tqdm(total=float(times[-1] - start), disable=not progress, unit="t") as bar:
+        run.tell = lambda t: bar.update(float(t - start) - bar.n)
         for part in range(int(now.part), len(ends)):
             t, end = ends[part - 1] if part else start, ends[part]
             if file is not None:  # from nothing but what is on disk
                 run.goes_on(t, now)
             here = (part == 0) & (times == t) | (times > t) & (times <= end)
             for i in [*np.flatnonzero(here), None]:
-                before = run.t
                 run.to(end if i is None else times[i])
-                bar.update(float(run.t - before))
                 if i is not None and not run.gone:
                     saved[i] = run.saved
             now = _Progress(np.array(part + 1), run.place, saved, run.counts, run.changes)
@@ -164,6 +164,7 @@ class _Run:
         self.contact: Contact | None = contact
         self.search: NeighborSearch | None = None
         self.counts, self.changes = np.zeros(3, int), np.zeros((0, 6))
+        self.tell: Callable = lambda t: None
         self.watch()
 
     def goes_on(self, t, now: _Progress) -> None:
@@ -229,6 +230,7 @@ class _Run:
                 continue
             self.count(steps, refused, 0)
             self.t, self.state, end = reached, new, target
+            self.tell(reached)
             if solution.result == dfx.RESULTS.event_occurred or float(reached) < float(target):
                 self.renew()
 

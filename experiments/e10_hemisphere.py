@@ -117,7 +117,7 @@ def adapted(n: int, method: js.GFDM, times) -> js.Evolution:
 
 
 def numbers_of_points(path: Path, n: int, solution: js.Evolution) -> None:
-    events = solution.history["events"]
+    events = solution.events
     number = n + np.cumsum(events["added"] - events["merged"])
     figure, ax = plt.subplots(figsize=(5.2, 3.4), layout="constrained")
     times = np.concatenate([[0.0], events["t"], solution.ts[-1:]])

@@ -62,7 +62,7 @@ def run(quick: bool, out: Path) -> list[Row]:
     times = [0.0, 0.05] if quick else [0.0, 0.05, 0.06, 0.2, 0.4]
     for least in (0.06,) if quick else (0.05, 0.035, 0.025):
         solution = flow(least, 0.06 if quick else 0.6, times)
-        events, setting = solution.history["events"], {"least spacing": least}
+        events, setting = solution.events, {"least spacing": least}
         pinched = events["t"][events["pinched"] > 0]
         rows.append(Row("necks pinched, at least", len(pinched), setting, None, source, 1, True))
         rows.append(Row("time of the first pinch", pinched.min(initial=np.inf), setting, 0.05))

@@ -172,8 +172,9 @@ class Discretization(eqx.Module):
     def expected_error(self) -> Float[Array, ""]:
         r"""Relative error to expect of the Laplacian, of fields as smooth as the surface.
 
-        $\|\Delta_S x + (d - 1) H n\| / \|\Delta_S x\|$ over all points: what the Laplacian makes of
-        the positions beside what the gradient makes of the normals. A few per cent: more points.
+        $\|\Delta_S x + (d - 1) H n\| / \|(d - 1) H n\|$ over all points: what the Laplacian
+        makes of the positions beside what the gradient makes of the normals. A few per cent: more
+        points.
 
         Accuracy: between a fifth and four times the error of fields that vary as fast, on smooth,
             coarse and random points (`tests/test_accuracy.py`). Of normals that are wrong it tells

@@ -52,11 +52,15 @@ def test_irregular_points_get_larger_neighborhoods():
     assert jnp.any(plain[0] > 0)
 
 
-def test_folds_of_a_scan_get_smaller_neighborhoods():
+def scan(read, n):
     try:
-        cloud = data.bunny(2_960)
+        return read(n)
     except FileNotFoundError as error:
         pytest.skip(str(error))
+
+
+def test_folds_of_a_scan_get_smaller_neighborhoods():
+    cloud = scan(data.bunny, 2_960)
     method = js.GFDM(degree=2)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # it bends within one stencil
@@ -69,10 +73,7 @@ def test_folds_of_a_scan_get_smaller_neighborhoods():
 
 def test_folds_that_no_neighbourhood_serves_get_positive_weights():
     """A dozen of rows in the folds of the Armadillo gave it modes that grow."""
-    try:
-        cloud = data.armadillo(10_000)
-    except FileNotFoundError as error:
-        pytest.skip(str(error))
+    cloud = scan(data.armadillo, 10_000)
     method = js.GFDM(degree=4)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # it bends within one stencil

@@ -195,7 +195,7 @@ def changed(
         found = _sought(surface, rows, adaptation)
         pairs, new = found.pairs, len(found.feet) + len(found.holes)
         if not len(pairs) + new:
-            return surface, rows.fields, added, merged
+            return surface, jax.tree.map(jnp.asarray, rows.fields), added, merged
         added, merged = added + new, merged + len(pairs)
         coming = _placed(surface, rows, found)
         surface, rows = exchanged(surface, rows, pairs.ravel(), coming, adaptation.capacity)
@@ -222,7 +222,7 @@ class _Sought(NamedTuple):
 
 def _sought(surface: Discretization, rows: Rows, adaptation: Adaptation) -> _Sought:
     cloud, lists, border = surface.cloud, surface.neighbors, surface.border
-    spacing, rank = np.asarray(rows.spacing), np.asarray(rows.rank)
+    spacing, rank = rows.spacing, rows.rank
     feet = normals = np.zeros((0, cloud.dim))
     if border is not None and cloud.dim == 3:
         feet, normals = map(np.asarray, border_gaps(cloud, border, adaptation.hole * spacing))
@@ -232,7 +232,7 @@ def _sought(surface: Discretization, rows: Rows, adaptation: Adaptation) -> _Sou
 
 def _placed(surface: Discretization, rows: Rows, found: _Sought) -> Rows:
     """One point for each pair, and one for each gap and hole."""
-    cloud, x, rank = surface.cloud, np.asarray(rows.points), np.asarray(rows.rank)
+    cloud, x, rank = surface.cloud, rows.points, rows.rank
     pairs, edge = found.pairs, slice(len(found.pairs), len(found.pairs) + len(found.feet))
     # What is on a border stays where it is.
     stays = rank[pairs[:, :1]] > 0
@@ -240,12 +240,11 @@ def _placed(surface: Discretization, rows: Rows, found: _Sought) -> Rows:
     at = np.concatenate([kept, found.feet, found.holes])
     degree, arrays = surface.method.polynomial_degree, (cloud.points, cloud.normals, rows.fields)
     points, normals, fields = _interpolated(cloud, surface.neighbors, degree, at, arrays)
-    on_edge = (jnp.asarray(a, points.dtype) for a in (found.feet, found.normals))
-    points, normals = (a.at[edge].set(b) for a, b in zip((points, normals), on_edge))
-    spacing = rows.spacing[nearest_points(cloud.points, cloud.active, jnp.asarray(at))]
+    points[edge], normals[edge] = found.feet, found.normals
+    spacing = rows.spacing[np.asarray(nearest_points(cloud.points, cloud.active, jnp.asarray(at)))]
     ranks = np.zeros(len(at), rank.dtype)
     ranks[: len(pairs)], ranks[edge] = rank[pairs[:, 0]], 1
-    return Rows(points, normals, fields, spacing, jnp.asarray(ranks))
+    return Rows(points, normals, fields, spacing, ranks)
 
 
 def conserved(before: Discretization, old, after: Discretization, new) -> PyTree[Array]:
@@ -259,15 +258,16 @@ def conserved(before: Discretization, old, after: Discretization, new) -> PyTree
     return jax.tree.map(corrected, old, new)
 
 
-def _interpolated(cloud, neighbors, degree: int, at, arrays) -> PyTree[Array]:
+def _interpolated(cloud, neighbors, degree: int, at, arrays) -> PyTree[np.ndarray]:
     """Points, normals and fields at some places above the surface, in one go."""
-    leaves, structure = jax.tree.flatten(arrays)
-    together = jnp.concatenate([u.reshape(len(u), -1) for u in leaves], axis=1)
+    leaves, structure = jax.tree.flatten(jax.tree.map(np.asarray, arrays))
+    together = np.concatenate([u.reshape(len(u), -1) for u in leaves], axis=1)
     count = len(at)
     room = _ROOM * 2 ** max(0, math.ceil(math.log2(count / _ROOM)))
-    padded = jnp.asarray(np.append(at, np.repeat(at[:1], room - count, axis=0), axis=0))
-    found = interpolated(cloud, neighbors, degree, padded.astype(cloud.points.dtype), together)
-    parts = jnp.split(found[:count], np.cumsum([u[0].size for u in leaves])[:-1], axis=1)
+    padded = np.append(at, np.repeat(at[:1], room - count, axis=0), axis=0)
+    padded = jnp.asarray(padded, cloud.points.dtype)
+    found = np.array(interpolated(cloud, neighbors, degree, padded, jnp.asarray(together)))[:count]
+    parts = np.split(found, np.cumsum([u[0].size for u in leaves])[:-1], axis=1)
     parts = [v.reshape(count, *u.shape[1:]).astype(u.dtype) for u, v in zip(leaves, parts)]
     points, normals, fields = jax.tree.unflatten(structure, parts)
-    return points, normals / jnp.linalg.norm(normals, axis=1, keepdims=True), fields
+    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True), fields

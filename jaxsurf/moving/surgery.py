@@ -211,12 +211,11 @@ def rejoined(
         if not on.any():
             return None, fields, found
         rows, stays = Rows.of(surface, fields, spacing), np.flatnonzero(on)
-        points = jnp.asarray(found.points, cloud.points.dtype)
-        normals = jnp.asarray(found.normals, cloud.points.dtype)
-        values, wanted = _means(cloud, stays, found.points, (fields, rows.spacing))
-        coming = Rows(points, normals, values, wanted, jnp.zeros(len(points), rows.rank.dtype))
+        values, wanted = _means(cloud, stays, found.points, (rows.fields, rows.spacing))
+        inside = np.zeros(len(found.points), rows.rank.dtype)
+        coming = Rows(found.points, found.normals, values, wanted, inside)
         surface, rows = exchanged(surface, rows, found.leaving, coming, capacity)
-        fields, spacing = rows.fields, np.asarray(rows.spacing)
+        fields, spacing = rows.fields, rows.spacing
     crumbs, parts = _crumbs(surface)
     if parts:
         none = np.zeros((0, cloud.dim))
@@ -228,7 +227,7 @@ def rejoined(
         nothing = jax.tree.map(lambda u: u[:0], rows)
         surface, rows = exchanged(surface, rows, crumbs, nothing, capacity)
         fields = rows.fields
-    return surface, fields, found
+    return surface, jax.tree.map(jnp.asarray, fields), found
 
 
 def _crumbs(surface: Discretization) -> tuple[Int[np.ndarray, " m"], int]:
@@ -239,12 +238,11 @@ def _crumbs(surface: Discretization) -> tuple[Int[np.ndarray, " m"], int]:
     return np.flatnonzero((part >= 0) & small[part]), int(small.sum())
 
 
-def _means(cloud: PointCloud, stays: Int[np.ndarray, " m"], points, values) -> PyTree[Array]:
+def _means(cloud: PointCloud, stays: Int[np.ndarray, " m"], points, values) -> PyTree[np.ndarray]:
     """Values at new points: Gaussian means over the points around."""
     x = np.asarray(cloud.points, float)[stays]
     distance, near = cKDTree(x).query(points, np.arange(1, 1 + min(_MEAN, len(stays))))
     shares = np.exp(-((distance / distance.mean(axis=1, keepdims=True)) ** 2))
-    shares = jnp.asarray(shares / shares.sum(axis=1, keepdims=True))
-    rows = jnp.asarray(stays[near])
-    mean = lambda u: jnp.einsum("pm,pm...->p...", shares.astype(u.dtype), u[rows])
+    shares = shares / shares.sum(axis=1, keepdims=True)
+    mean = lambda u: np.einsum("pm,pm...->p...", shares.astype(u.dtype), u[stays[near]])
     return jax.tree.map(mean, values)

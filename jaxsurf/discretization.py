@@ -357,13 +357,8 @@ class Discretization(eqx.Module):
         """
         diagnostics = self.laplacian.diagnostics
         assert diagnostics is not None
-        code = judged(self.cloud, self.neighbors, diagnostics.residual)
-        if self.found_at is not None:
-            far = unreached(self.found_at, self.cloud.points, self.neighbors)
-            code = jnp.where((code == 0) & far, 4, code)
-        if self.found is not None:
-            code = jnp.where((self.found > 0) & ((code == 0) | (code > 2)), self.found, code)
-        return jax.lax.stop_gradient(code)
+        where = self.cloud, self.neighbors, self.found_at, self.found
+        return jax.lax.stop_gradient(_code(*where, diagnostics.residual))
 
     def check(self) -> None:
         """Raise a ValueError that names the first point of the least `code` above 0; not traced."""
@@ -419,6 +414,16 @@ def _operators(cloud, neighbors, method) -> tuple[Stencil, ...]:
     """The Laplacian, and what comes with it for nothing."""
     surface = Discretization(cloud, neighbors, method)
     return surface._joint if method.shares_moments else (surface._laplacian,)
+
+
+@jax.jit
+def _code(cloud, neighbors, found_at, found, residual):
+    code = judged(cloud, neighbors, residual)
+    if found_at is not None:
+        code = jnp.where((code == 0) & unreached(found_at, cloud.points, neighbors), 4, code)
+    if found is not None:
+        code = jnp.where((found > 0) & ((code == 0) | (code > 2)), found, code)
+    return code
 
 
 @copying_jit

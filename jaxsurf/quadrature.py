@@ -94,13 +94,20 @@ def cell_areas(
             "border not marked?",
             stacklevel=4,
         )
+    sizes, bad = _completed(sizes, closed, neighbors)
+    return refuse(sizes, bad, "the cell of point {i} has the area {v}", sizes)
+
+
+@jax.jit
+def _completed(sizes, closed, neighbors):
+    """With the mean of the neighbours in place of what is not closed; where there is none."""
     good = closed & (sizes > 0)
     counted = neighbors.mask & good[neighbors.indices]
     total = jnp.sum(jnp.where(counted, sizes[neighbors.indices], 0), axis=1)
     mean = total / jnp.maximum(jnp.sum(counted, axis=1), 1)
     on = neighbors.mask[:, 0]
     sizes = jnp.where(good | ~on, sizes, mean)
-    return refuse(sizes, on & ~(sizes > 0), "the cell of point {i} has the area {v}", sizes)
+    return sizes, on & ~(sizes > 0)
 
 
 def _by_enough(look: Callable, k: int):
@@ -136,16 +143,26 @@ def cell_weights(
     planes, mask, moments, closed = _cells(cloud, neighbors, degree, cells, outward)
     weights, residual = _weights_of_blocks(planes, mask, moments, degree)
     weights, (closed, residual) = rows_of(weights, (closed, residual), cloud.n)
-    on = neighbors.mask[:, 0]
-    return weights, closed | ~on, jnp.where(on, residual, 0)
+    return weights, *_where_on(neighbors.mask, closed, residual)
 
 
 def _cell_sizes(cloud, neighbors, degree, cells, outward):
     planes, _, moments, closed = _cells(cloud, neighbors, degree, cells, outward)
-    sizes = planes.width ** planes.points.shape[1] * moments[:, 0]
+    sizes = _scaled(planes.width, planes.points.shape[1], moments)
     _, (sizes, closed) = rows_of(moments, (sizes, closed), cloud.n)
-    on = neighbors.mask[:, 0]
-    return jnp.where(on, sizes, 0), closed | ~on
+    closed, sizes = _where_on(neighbors.mask, closed, sizes)
+    return sizes, closed
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _scaled(width, dim: int, moments):
+    return width**dim * moments[:, 0]
+
+
+@jax.jit
+def _where_on(mask, closed, values):
+    on = mask[:, 0]
+    return closed | ~on, jnp.where(on, values, 0)
 
 
 def _cells(cloud, neighbors, degree, cells, outward):

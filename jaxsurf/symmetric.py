@@ -176,11 +176,15 @@ def symmetrised(
     """The symmetric operator on the slots of another Laplacian of the same lists."""
     flux = None if border is None else outflow(cloud, border)
     weights, left = positive_weights(cloud, neighbors, masses, flux)
-    weights = (weights / jnp.where(masses > 0, masses, 1))[None]
-    operator = laplacian.of_weights(with_center(weights)[0])
+    operator = laplacian.of_weights(_per_mass(weights, masses))
     # No border: the condition there is part of it.
     parts, none = lambda o: (o.diagnostics.residual, o.border), lambda x: x is None
     return eqx.tree_at(parts, operator, (left, None), is_leaf=none)
+
+
+@jax.jit
+def _per_mass(weights, masses):
+    return with_center((weights / jnp.where(masses > 0, masses, 1))[None])[0]
 
 
 @sized_jit

@@ -253,6 +253,7 @@ def _looped(solver: RKC2, adjoint: dfx.AbstractAdjoint) -> RKC2:
     return RKC2(solver.spectral_radius, solver.max_stages, loop)
 
 
+@jax.jit
 def _shortest(t0: Array, t1: Array) -> Array:
     """A step that is not worth trying: much shorter than all, or lost in the time."""
     lost = 4 * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))

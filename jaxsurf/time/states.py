@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from ..arguments import count_on, switched_off
 
 
+@jax.jit
 def length(y: PyTree[Array]) -> Float[Array, ""]:
     """Euclidean norm of all entries."""
     return jnp.sqrt(sum(jnp.sum(leaf * leaf) for leaf in jax.tree.leaves(y)))

@@ -119,17 +119,17 @@ def table(results: list[dict], quick: bool) -> str:
               f"| {plain['gradient plain JAX s']:.3f} |"]  # fmt: skip
     beside = [r for r in results if r["case"] == "build_beside_compadre"]
     if beside:
-        lines += ["", "| beside Compadre, in one run | k | ours s | Compadre s | / ours "
-                  "| applying / ours | error | its error |",
+        lines += ["", "| beside Compadre, in one run | its threads | ours s | its s | ours / its "
+                  "| applying, ours / its | error | its error |",
                   "|---|---|---|---|---|---|---|---|"]  # fmt: skip
     for r in beside:
-        v, degree = r["result"], r["arguments"][0]
-        lines.append(
-            f"| degree {degree} | {cases.METHODS[f'GFDM(degree={degree})'][1]} "
-            f"| {v['ours s']:.2f} | {v['Compadre s']:.1f} "
-            f"| {v['Compadre / ours']:.0f} | {v['applying, Compadre / ours']:.0f} "
-            f"| {v['error']:.1e} | {v['Compadre error']:.1e} |"
-        )
+        for name, v in r["result"].items():
+            lines.append(
+                f"| `{name}`, k = {cases.METHODS[name][1]} | {r['arguments'][1]} "
+                f"| {v['ours s']:.2f} | {v['Compadre s']:.1f} | {v['ours / Compadre']:.2f} "
+                f"| {v['applying, ours / Compadre']:.2f} "
+                f"| {v['error']:.1e} | {v['Compadre error']:.1e} |"
+            )
     lines += ["", "| DCPSE(order=2), n | build s | peak GiB |", "|---|---|---|"]
     for r in results:
         if r["case"] == "build" and r["arguments"][0] == "DCPSE(order=2)":
@@ -145,7 +145,7 @@ def main() -> None:
     )
     parser.add_argument("--quick", action="store_true", help="smaller sizes")
     parser.add_argument("--compadre", action="store_true",
-                        help="GFDM beside pycompadre, in the same run (extra: peers)")  # fmt: skip
+                        help="also beside pycompadre, in the same run (extra: peers)")  # fmt: skip
     parser.add_argument("--only", metavar="NAME", help="cases of one function or method")
     parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR")
     parser.add_argument("--readme", action="store_true", help="put the table into the README")
@@ -161,7 +161,11 @@ def main() -> None:
         print(json.dumps(case(*json.loads(arguments))))
         return
     start, results = time.perf_counter(), []
-    beside = [("build_beside_compadre", [p, 20_000 if options.quick else 100_000]) for p in (2, 4)]
+    beside = [
+        ("build_beside_compadre", [p, threads, 20_000 if options.quick else 100_000])
+        for p in (2, 4)
+        for threads in (1, 2)
+    ]
     plans = {
         "stencils": lambda quick: plan(quick) + (beside if options.compadre else []),
         "heat": heat.plan,

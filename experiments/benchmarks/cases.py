@@ -100,19 +100,19 @@ def build_beside_numpy(degree: int, k: int, n: int) -> dict:
     return found
 
 
-def build_beside_compadre(degree: int, n: int) -> dict:
-    """GFDM beside Compadre's moving least squares on manifolds, in turn, in one process.
+def build_beside_compadre(degree: int, threads: int, n: int) -> dict:
+    """GFDM and DC-PSE beside Compadre's moving least squares on manifolds, in turn, in one process.
 
     Compadre is given its usual window of 1.6 times the distance to as many points as it has
-    unknowns; it fits its own frames and searches its own neighbours, neither of which is timed. It
-    uses as many threads as OMP_NUM_THREADS says.
+    unknowns; it fits its own frames and searches its own neighbours, neither of which is timed.
+
+    Args:
+        threads: that Compadre may use.
     """
+    os.environ["OMP_NUM_THREADS"] = str(threads)
     import pycompadre
 
-    name = f"GFDM(degree={degree})"
-    method, k = METHODS[name]
-    cloud, neighbors = _sphere(n, k)
-    points = np.array(cloud.points)  # Compadre wants to be able to write
+    points = np.array(js.sphere(n).points)  # Compadre wants to be able to write
     a = np.array([1.0, 2.0, 1.5])
     s = points @ a
     u, exact = np.exp(s), np.exp(s) * (a @ a - s**2 - 2 * s)
@@ -125,24 +125,26 @@ def build_beside_compadre(degree: int, n: int) -> dict:
     helper.generateKDTree(points)
     gmls.addTargets(target)
     helper.generateNeighborListsFromKNNSearchAndSet(points, degree, 2, 1.6)
-    build, theirs, ratio = side_by_side(
-        lambda: _laplacian(cloud, neighbors, method).weights,
-        lambda: gmls.generateAlphas(1, False),
-        3,
-    )
-    operator = _laplacian(cloud, neighbors, method)
-    call, values = jax.jit(lambda operator, u: operator(u)), jnp.asarray(u)
-    apply, their_apply, apply_ratio = side_by_side(
-        lambda: call(operator, values), lambda: helper.applyStencil(u[:, None], target), 5
-    )
-    found = {
-        "ours s": build, "Compadre s": theirs, "Compadre / ours": 1 / ratio,
-        "ours ms": 1e3 * apply, "Compadre ms": 1e3 * their_apply,
-        "applying, Compadre / ours": 1 / apply_ratio,
-        "threads": os.environ.get("OMP_NUM_THREADS", "all"),
-        "error": relative_l2(operator(values), exact),
-        "Compadre error": relative_l2(np.ravel(helper.applyStencil(u[:, None], target)), exact),
-    }  # fmt: skip
+    values = jnp.asarray(u)
+
+    def beside(name: str) -> dict:
+        method, k = METHODS[name]
+        cloud, neighbors = _sphere(n, k)
+        ours = lambda: _laplacian(cloud, neighbors, method)
+        seconds, theirs, ratio = side_by_side(
+            lambda: ours().weights, lambda: gmls.generateAlphas(1, False), 3
+        )
+        operator, call = ours(), jax.jit(lambda operator, u: operator(u))
+        their_values = lambda: helper.applyStencil(u[:, None], target)
+        *_, apply_ratio = side_by_side(lambda: call(operator, values), their_values, 5)
+        return {
+            "ours s": seconds, "Compadre s": theirs, "ours / Compadre": ratio,
+            "applying, ours / Compadre": apply_ratio,
+            "error": relative_l2(operator(values), exact),
+            "Compadre error": relative_l2(np.ravel(their_values()), exact),
+        }  # fmt: skip
+
+    found = {name: beside(name) for name in (f"GFDM(degree={degree})", f"DCPSE(order={degree})")}
     gmls = helper = None  # let go in this order, as Compadre asks for
     del kokkos
     return found

@@ -18,7 +18,7 @@ from .compiling import copying_jit
 from .failures import is_concrete, needs_values, raise_at
 from .interpolation import interpolated
 from .kept import Kept
-from .motion import CODES, folded, judged, moved_cloud, unreached
+from .motion import CODES, code_of, folded, moved_cloud
 from .neighbors import Neighbors, switched_on
 from .renew import NeighborSearch, renewed
 from .stencils.algebra import Composition
@@ -358,7 +358,7 @@ class Discretization(eqx.Module):
         diagnostics = self.laplacian.diagnostics
         assert diagnostics is not None
         where = self.cloud, self.neighbors, self.found_at, self.found
-        return jax.lax.stop_gradient(_code(*where, diagnostics.residual))
+        return jax.lax.stop_gradient(code_of(*where, diagnostics.residual))
 
     def check(self) -> None:
         """Raise a ValueError that names the first point of the least `code` above 0; not traced."""
@@ -414,16 +414,6 @@ def _operators(cloud, neighbors, method) -> tuple[Stencil, ...]:
     """The Laplacian, and what comes with it for nothing."""
     surface = Discretization(cloud, neighbors, method)
     return surface._joint if method.shares_moments else (surface._laplacian,)
-
-
-@jax.jit
-def _code(cloud, neighbors, found_at, found, residual):
-    code = judged(cloud, neighbors, residual)
-    if found_at is not None:
-        code = jnp.where((code == 0) & unreached(found_at, cloud.points, neighbors), 4, code)
-    if found is not None:
-        code = jnp.where((found > 0) & ((code == 0) | (code > 2)), found, code)
-    return code
 
 
 @copying_jit

@@ -137,6 +137,17 @@ def unreached(before, after, neighbors, share=_SKIN):
     return stretch * farthest < share * jnp.max(new, axis=0)
 
 
+@jax.jit
+def code_of(cloud, neighbors, found_at, found, residual):
+    """Codes of points, also of lists that no longer reach and of what was found with these."""
+    code = judged(cloud, neighbors, residual)
+    if found_at is not None:
+        code = jnp.where((code == 0) & unreached(found_at, cloud.points, neighbors), 4, code)
+    if found is not None:
+        code = jnp.where((found > 0) & ((code == 0) | (code > 2)), found, code)
+    return code
+
+
 @sized_jit
 def stretch(before, after, neighbors):
     """By which factor neighbourhoods have grown: the root of mean squared distances; 1 if empty."""

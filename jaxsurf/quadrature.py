@@ -14,34 +14,26 @@ import functools
 import warnings
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.special
 from jaxtyping import Array, Bool, Float
 
 from .build import blocks_of, determined, neighborhood, rows_of
 from .cloud import PointCloud
 from .compiling import sized_jit
 from .failures import is_concrete, refuse
-from .fits.graph import Graph, polynomial
+from .fits.graph import Graph
 from .fits.moments import blockwise, in_blocks, moment_solve
-from .fits.monomials import monomials_by_degree, polynomial_count
+from .fits.monomials import polynomial_count
 from .fits.plane import TangentPlane
+from .fits.polygon import Sides, moments_over, ways_of
 from .neighbors import Neighbors
 from .stencils.method import AbstractMethod, with_center
 
 _BATCH = 128
-# Newton steps from cells with straight sides to those on the surface: each squares what is left of
-# an error of the size (spacing x curvature)^2.
-_STEPS = 2
-# Sides that it puts so much farther out than straight ones, or behind the point, are not found.
-_STRETCH = 2.0
 # So many neighbours may bound a cell; where points are very uneven, all are tried.
 _CELLS = 24
-# Of these so many are its sides at most, or half of those that are tried.
-_SIDES = 16
 
 
 def cells_of(cloud: PointCloud, neighbors: Neighbors, method: AbstractMethod, border):
@@ -192,8 +184,7 @@ def _surfaces(blocks, degree: int):
 def _ways_of_blocks(planes, mask, lines, cells: int):
     def ways(block):
         plane, mask, line = block
-        sides = Sides.of(plane, mask, cells, line)
-        return _ways_of_curve(sides) if len(sides.flat) == 1 else _ways(sides)
+        return ways_of(Sides.of(plane, mask, cells, line))
 
     return blockwise(ways, (planes, mask, lines))
 
@@ -202,7 +193,7 @@ def _ways_of_blocks(planes, mask, lines, cells: int):
 def _moments_of_blocks(planes, graphs, mask, lines, ways, cells: int):
     def moments(block):
         plane, graph, mask, line, (ways, room) = block
-        found, reach = _moments(Sides.of(plane, mask, cells, line), graph, ways)
+        found, reach = moments_over(Sides.of(plane, mask, cells, line), graph, ways)
         return found, 4 * reach <= room
 
     return blockwise(moments, (planes, graphs, mask, lines, ways))
@@ -220,222 +211,3 @@ def _weights_of_blocks(planes, mask, moments, degree: int):
         return jnp.where(mask, eta, 0), residual
 
     return blockwise(weights, (planes, mask, moments))
-
-
-class Sides(eqx.Module):
-    r"""What bounds a cell: the planes $x\cdot d = b$ half way to its neighbours.
-
-    Args:
-        flat: d along the tangents.
-        high: d along the normal.
-        offset: b.
-        on: which of them count.
-    """
-
-    flat: Float[Array, "t r *p"]
-    high: Float[Array, "r *p"]
-    offset: Float[Array, "r *p"]
-    on: Bool[Array, "r *p"]
-
-    @classmethod
-    def of(cls, plane: TangentPlane, mask, cells: int, outward) -> Sides:
-        """Those of the first neighbours, and at the end of a surface the line of its border."""
-        flat, high, on = plane.points[:, 1:cells], plane.heights[1:cells], mask[1:cells]
-        offset = (jnp.sum(flat**2, axis=0) + high**2) / 2
-        if outward is not None:
-            line = jnp.sum(plane.tangents * outward, axis=1)[:, None]
-            flat = jnp.concatenate([flat, line], axis=1)
-            high, offset = (jnp.pad(a, [(0, 1)] + [(0, 0)] * (a.ndim - 1)) for a in (high, offset))
-            on = jnp.concatenate([on, jnp.any(line != 0, axis=0)])
-        return cls(flat, high, jnp.where(on, offset, 0), on)
-
-    def chosen(self, which) -> Sides:
-        """One of them at every place, by number."""
-        pick = lambda a: jnp.take_along_axis(a, which, axis=0)
-        flat = jnp.stack([pick(a) for a in self.flat])
-        return Sides(flat, pick(self.high), pick(self.offset), jnp.ones_like(which, bool))
-
-    def miss(self, graph: Graph, q):
-        """How far the points of the surface over q are beyond them, and the slope of that."""
-        z, slope = graph.at(q)
-        beyond = jnp.sum(q * self.flat, axis=0) + z * self.high - self.offset
-        return beyond, self.flat + slope * self.high
-
-
-def _moments(sides: Sides, graph: Graph, ways):
-    r"""$\int q^\gamma\,dA$ over a cell for all monomials up to the degree, and how far it reaches.
-
-    The latter squared.
-    """
-    if graph.dim == 1:
-        found, reach = _along_ways(sides.chosen(ways[2]), graph, *ways[:2])
-        # The nearest to either side bound a curve's cell, if it is found at all.
-        return found, jnp.where(reach < jnp.inf, 0, reach)
-    side, still = ways
-    count, few = len(side), len(side) // 2
-    after = jnp.where(still, side[:1], jnp.roll(side, -1, axis=0))
-    # Few cells have sides in the second half, and most blocks have none of these. The one before
-    # each half has the corner at which it begins.
-    halves = np.minimum(np.arange(0, count, few)[:, None] + np.arange(-1, few), count - 1)
-    ended = [jnp.zeros((), bool), *(jnp.all(still[row[0]]) for row in halves[1:])]
-
-    def half(these):
-        side, after, ended = these
-        none = jnp.zeros((size, *side.shape[1:]), graph.coefficients.dtype)
-        of_sides = lambda: _over_sides(sides.chosen(side), sides.chosen(after), graph)
-        return jax.lax.cond(ended, lambda: (none, none[0]), of_sides)
-
-    size = polynomial_count(graph.dim, graph.degree)
-    found, reach = jax.lax.map(half, (side[halves], after[halves], jnp.stack(ended)))
-    return jnp.sum(found, axis=0), jnp.max(reach, axis=0)
-
-
-def _over_sides(these: Sides, those: Sides, graph: Graph):
-    """What triangles between the point and each side add to the moments of a cell.
-
-    Args:
-        these: sides in turn, of which the first is that before.
-        those: what cuts each of them off.
-    """
-
-    def newton(q, these, those, graph):
-        (u, a), (v, b) = these.miss(graph, q), those.miss(graph, q)
-        return q - _meeting(u, v, *jax.lax.stop_gradient((a, b)))
-
-    straight = _meeting(these.offset, those.offset, these.flat, those.flat)
-    corners = _root(newton, jax.lax.stop_gradient(straight), these, those, graph)
-    first, last = corners[:, :-1], corners[:, 1:]
-    turn = first[0] * last[1] - first[1] * last[0]
-    share, weights = _gauss(_nodes(graph), 0)
-    ends = jnp.concatenate([first + x * (last - first) for x in share], axis=1)
-    again = jax.tree.map(lambda a: jnp.concatenate([a[..., 1:, :]] * len(share), axis=-2), these)
-    found, reach = _along_ways(again, graph, ends, jnp.concatenate([w * turn for w in weights]))
-    corners = jnp.max(jnp.sum(jax.lax.stop_gradient(corners) ** 2, axis=0), axis=0)
-    return found, jnp.maximum(corners, reach)
-
-
-def _along_ways(sides: Sides, graph: Graph, ends, measure):
-    """The moments from those of ways that end at sides, and how far these reach, squared.
-
-    That is infinite where the surface bends so much within the cell that a side is not found.
-
-    Args:
-        ends: of the ways if the sides were straight.
-        measure: what each stands for then.
-    """
-    degree, nodes = graph.degree, _nodes(graph)
-
-    def newton(length, sides, graph, ends):
-        beyond, slope = sides.miss(graph, length * ends)
-        rate = jax.lax.stop_gradient(jnp.sum(slope * ends, axis=0))
-        return length - beyond / jnp.where(rate > 0, rate, 1)
-
-    length = _root(newton, jnp.ones_like(measure), sides, graph, ends)
-    ends = length * ends
-    measure = measure * length**graph.dim
-
-    # Along a way each monomial is a power.
-    rows = monomials_by_degree(ends, degree)
-    at, share = (np.array(a, length.dtype) for a in _gauss(nodes, graph.dim - 1))
-    powers = at ** np.arange(degree + 1)[:, None].astype(length.dtype)
-    square = jnp.ones((nodes, *length.shape), length.dtype)
-    for slope in graph.slopes:
-        along = jnp.stack([polynomial([c], [row]) for c, row in zip(slope, rows)])
-        square = square + jnp.tensordot(powers[:-1].T, along, 1) ** 2
-    sums = jnp.tensordot(powers * share, jnp.sqrt(square), 1) * measure
-    found = [jnp.sum(row * total, axis=1) for row, total in zip(rows, sums)]
-    length, ends = jax.lax.stop_gradient((length, ends))
-    resolved = (length > 0) & (length < _STRETCH)
-    reach = jnp.where(resolved, jnp.sum(ends**2, axis=0), jnp.inf)
-    # The line of a border passes through the point: there is nothing between them.
-    reach = jnp.where(sides.offset > 0, reach, 0)
-    return jnp.concatenate(found), jnp.max(reach, axis=0)
-
-
-def _nodes(graph: Graph) -> int:
-    """Of Gauss's rule: exact for the polynomials of the surface."""
-    return graph.degree // 2 + 1
-
-
-def _ways(sides: Sides):
-    """The sides of a cell in turn.
-
-    Returns:
-        Their numbers, and whether each is the last; and the square of twice as far as the cell may
-        reach: no point beyond the neighbours looked at can then have a part of it. Negative where
-        it is not closed.
-    """
-    side, following, closed = _round(sides.flat, sides.offset, sides.on)
-    away = jnp.where(sides.on & (sides.offset > 0), jnp.sum(sides.flat**2, axis=0), 0)
-    return (side, following == side[0]), jnp.where(closed, jnp.max(away, axis=0), -1)
-
-
-def _meeting(u, v, a, b):
-    r"""Where two lines meet, those of $q\cdot a = u$ and of $q\cdot b = v$."""
-    size = a[0] * b[1] - a[1] * b[0]
-    return jnp.stack([b[1] * u - a[1] * v, a[0] * v - b[0] * u]) / jnp.where(size == 0, 1, size)
-
-
-def _round(flat, offset, on):
-    """Once round a cell, counter-clockwise from its nearest side: each side, and what cuts it off.
-
-    Where there are fewer sides than steps, the last of them stand still.
-    """
-    squared = jnp.sum(flat**2, axis=0)
-    on = on & (squared > 0)
-    foot = offset / jnp.where(on, squared, 1)
-    numbers = np.arange(len(on), dtype=np.int32)[:, None]
-
-    def least(a):
-        # `argmin` takes several times as long.
-        low = jnp.min(a, axis=0)
-        return jnp.min(jnp.where(a == low, numbers, len(a) - 1), axis=0), low < jnp.inf
-
-    def advance(state):
-        side, following, found = state
-        side = jnp.where(following == start, side, following)
-        # Side j is f d_j + t c with c perpendicular to d_j, of which all others cut off a part.
-        x, y, f = (jnp.take_along_axis(a, side[None], axis=0)[0] for a in (*flat, foot))
-        cross = x * flat[1] - y * flat[0]
-        cuts = on & (cross > 0) & (numbers != side)
-        room = offset - f * (x * flat[0] + y * flat[1])
-        following, cut = least(jnp.where(cuts, room / jnp.where(cuts, cross, 1), jnp.inf))
-        return side, following, found & cut
-
-    def step(state, first):
-        state = jax.lax.cond(first | jnp.any(state[1] != start), advance, lambda s: s, state)
-        return state, state[:2]
-
-    start, found = least(jnp.where(on, foot * offset, jnp.inf))
-    firsts = np.arange(max(_SIDES, len(on) // 2)) == 0
-    state, (side, following) = jax.lax.scan(step, (start, start, found), firsts)
-    return side, following, state[2] & (state[1] == start)
-
-
-def _ways_of_curve(sides: Sides):
-    """The ways to either side of a curve's cell, and the numbers of these; room as above."""
-    # The product of an end and the way to it does not depend on the end.
-    flat, offset, on = sides.flat[0], sides.offset, sides.on
-    at = offset / jnp.where(flat == 0, 1, flat)
-    after = jnp.where(on & (flat > 0), at, jnp.inf)
-    before = jnp.where(on & (flat < 0), at, -jnp.inf)
-    ends = jnp.stack([jnp.max(before, axis=0), jnp.min(after, axis=0)])
-    which = jnp.stack([jnp.argmax(before, axis=0), jnp.argmin(after, axis=0)])
-    closed = jnp.all(jnp.isfinite(ends), axis=0)
-    ends = jnp.where(jnp.isfinite(ends), ends, 0)
-    return (ends[None], jnp.abs(ends), which), jnp.where(closed, 0, -1)
-
-
-def _root(newton: Callable, start, *known):
-    """The end of some Newton steps, of which the last has the derivative of the root."""
-    fixed = jax.lax.stop_gradient(known)
-    near = jax.lax.fori_loop(0, _STEPS, lambda _, x: newton(x, *fixed), start)
-    # Without the barrier the compiler finds the value again for every use of it.
-    return jax.lax.optimization_barrier(newton(jax.lax.stop_gradient(near), *known))
-
-
-@functools.cache
-def _gauss(nodes: int, power: int) -> tuple[list[float], list[float]]:
-    r"""Gauss's rule for $\int_0^1 s^p f(s)\,ds$."""
-    x, w = scipy.special.roots_jacobi(nodes, 0, power)
-    return ((1 + x) / 2).tolist(), (w / 2 ** (power + 1)).tolist()

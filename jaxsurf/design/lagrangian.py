@@ -15,6 +15,7 @@ from ..arguments import as_float
 from ..compiling import sized_jit
 from ..discretization import Discretization
 from ..failures import marking
+from ..functions import Traced, canonical
 from ..motion import judged, unreached
 from .crossing import crosses
 from .shape import AbstractShape
@@ -198,6 +199,13 @@ def started(optimizer, theta):
 def strong(tree: PyTree) -> PyTree:
     """The same arrays, none of them weakly typed: what comes out can go in again."""
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.asarray(x).dtype), tree)
+
+
+def computed(problem: Problem, theta: PyTree) -> list[Traced]:
+    """What the user's functions compute, as programs, which tell them apart."""
+    measured = lambda theta: problem.measured(problem.shape(theta))
+    with marking():
+        return [canonical(f, theta) for f in (measured, problem.projected)]
 
 
 def kinds(problem: Problem, theta: PyTree) -> tuple:

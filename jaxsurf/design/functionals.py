@@ -191,9 +191,9 @@ def signed_distance(surface: Discretization, points: Float[Array, "m d"]) -> Flo
     degree = surface.method.polynomial_degree
     known = (cloud, neighbors, points)
     seen = without_derivatives(known)
-    *fixed, y = stop_gradient(seen if is_concrete(seen) else known)
-    nearest = nearest_points(fixed[0].points, cloud.active, y)
-    feet = stop_gradient(_feet(*fixed, y, nearest, degree))
+    fixed, lists, y = stop_gradient(seen if is_concrete(seen) else known)
+    nearest = nearest_points(fixed.points, cloud.active, y)
+    feet = stop_gradient(_feet(fixed, lists, y, nearest, degree))
     text = (
         "points: the foot of {i} is not found: it is {v:.3g} away from the nearest point of the "
         "cloud, whose neighbours reach {reach:.3g}"

@@ -66,6 +66,11 @@ class AbstractEvolution(eqx.Module):
         return False
 
     @property
+    def growth(self) -> ArrayLike:
+        r"""No solution grows faster than $e^{gt}$ in the root mean square; infinite if unknown."""
+        return 0.0 if self.contractive else np.inf
+
+    @property
     def active(self) -> Bool[Array | np.ndarray, " n"] | None:
         """False at points that are switched off, as its operators say; None if all are on."""
         return known_active(*vars(self).values())

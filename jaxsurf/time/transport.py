@@ -143,6 +143,15 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         return self.reaction is None and self.closure is None and not compressed
 
     @property
+    def growth(self):
+        known = self.advection is not None and self.conservative
+        if not known or self.reaction is not None or self.closure is not None:
+            return super().growth
+        assert self.advection is not None and self.gradient is not None
+        one = jnp.ones(self.n, self.gradient.weights.dtype)
+        return jnp.max(jnp.abs(self.advection(one)))  # that of the divergence
+
+    @property
     def n(self):
         return next(op.n for op in (self.laplacian, self.gradient) if op is not None)
 

@@ -111,7 +111,7 @@ def compliance(
         True
     """
     _closed(surface)
-    f = as_float(f, "load", (surface.n,))
+    f = finite(as_float(f, "load", (surface.n,)), "load", surface.cloud.active)
     real(screening, "screening", least=0)
     needs_values("screening", screening, instead="give a number from outside")
     free = float(screening) == 0

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..arguments import as_float
+from ..arguments import as_float, traced_call
 from ..compiling import sized_jit
 from ..discretization import Discretization
 from ..failures import marking
@@ -78,7 +78,7 @@ class Problem(eqx.Module):
 
     def measured(self, surface: Discretization) -> tuple[Array, dict, dict]:
         """Objective, equalities and inequalities."""
-        value = lambda f, name: as_float(f(surface, *self.args), name)
+        value = lambda f, name: as_float(traced_call(f, name, surface, *self.args), name)
         each = lambda some: {name: value(f, f"constraint {name!r}") for name, f in some.items()}
         return value(self.objective, "objective"), each(self.equalities), each(self.inequalities)
 

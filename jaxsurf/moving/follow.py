@@ -277,7 +277,12 @@ class _Run:
             with contextlib.suppress(ValueError):
                 found = surface.moved(cloud.points, cloud.normals, search=self.search)
         if found is None:
-            found = discretize(cloud, method=surface.method)
+            try:
+                found = discretize(cloud, method=surface.method)
+            except ValueError as error:
+                raise ValueError(
+                    f"at t = {float(self.t):g} neighbours could not be found anew: {error}"
+                ) from error
             self.search = found.search()
         self.moving = Moving.of(found, self.moving.motion, self.moving.on)
         self.watch()

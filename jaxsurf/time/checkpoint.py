@@ -42,7 +42,7 @@ class Checkpoint(eqx.Module):
 
     Raises:
         TypeError: a path or a time that is none.
-        ValueError: a time that is not positive.
+        ValueError: a time that is not positive, a folder that is not there.
 
     Example:
         >>> cloud = js.sphere(300)
@@ -60,6 +60,10 @@ class Checkpoint(eqx.Module):
     def __init__(self, path: str | Path, every: float):
         if not isinstance(path, str | os.PathLike):
             raise TypeError(f"path is a {type(path).__name__}, expected the path of a file")
+        if not Path(path).absolute().parent.is_dir():
+            raise ValueError(
+                f"path is {str(path)!r}: there is no folder {str(Path(path).parent)!r}"
+            )
         self.path, self.every = Path(path), float(real(every, "every", above=0))
 
 

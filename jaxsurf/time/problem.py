@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..arguments import as_float, instance
+from ..arguments import traced_call as user
 from ..boundary import Closure
 from ..failures import is_concrete
 from ..stencils.algebra import AbstractOperator
-from .coefficients import InTime, user
+from .coefficients import InTime
 from .implicit import IMEX
 from .states import added, only_on
 

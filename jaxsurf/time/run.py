@@ -180,6 +180,7 @@ def planned(
         controller = dfx.PIDController(rtol, atol, dtmin=shortest, force_dtmin=False)
     elif controller is None:
         controller = dfx.ConstantStepSize()
+    _check_tolerances(controller, t0.dtype)
     saveat = check_saves(dfx.SaveAt(t1=True) if saveat is None else saveat, t0, t1)
     allowed = _allowed(max_steps, saveat, t0, t1, dt0, controller)
     check_coefficients(problem, t0, t1)
@@ -206,6 +207,19 @@ def planned(
     throw = bool(throw) and not concrete and not is_marking()
     run = Run(*parts, allowed, bool(progress), throw)
     return Plan(run, name, f"{name}: given" if why == "given" else why, concrete)
+
+
+def _check_tolerances(controller: dfx.AbstractStepSizeController, dtype) -> None:
+    """Refuse those that no step meets: it would be tried ever shorter, for ever."""
+    if not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
+        return
+    numbers: dict[str, Any] = {name: getattr(controller, name, None) for name in ("rtol", "atol")}
+    for name, value in numbers.items():
+        if value is None or not is_concrete(value) or jnp.ndim(value):
+            return
+        real(value, f"controller.{name}", least=0)
+    if not numbers["atol"] > 0:
+        within_round_off(numbers["rtol"], dtype, "controller.rtol")
 
 
 _LIKE = dict(

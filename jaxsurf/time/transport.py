@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..arguments import as_float, finite, instance, switched_off
+from ..arguments import as_float, finite, flag, instance, switched_off
+from ..arguments import traced_call as user
 from ..boundary import Closure
 from ..failures import is_concrete
 from ..operators import divergence_of
@@ -24,7 +25,6 @@ from .coefficients import (
     check_operator,
     coefficient,
     function,
-    user,
 )
 from .explicit import RKC2
 from .implicit import IMEX
@@ -118,7 +118,7 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         self.laplacian = laplacian
         self.diffusivity = coefficient(diffusivity, "diffusivity", 0, on)
         self.reaction, self.stabilization = function(reaction, "reaction"), stabilization
-        self.conservative, self.closure = bool(conservative), closure
+        self.conservative, self.closure = flag(conservative, "conservative"), closure
         self.mass = check_mass(mass, closure, n, on)
         self.advection, self.gradient, self.velocity = None, None, None
         if velocity is not None:

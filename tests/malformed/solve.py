@@ -224,4 +224,6 @@ CASES = [
     ],
     Case("multigrid", "a zero row", lambda: js.multigrid(js.Stencil(
         laplacian().indices, laplacian().weights.at[:, 5].set(0.0))), ("row 5",)),
+    Case("eigenmodes", "an operator of the other sign", lambda: js.eigenmodes(-laplacian(), 3),
+         ("eigenvalues", "below 0", "-operator")),
 ]  # fmt: skip

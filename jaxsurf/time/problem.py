@@ -67,7 +67,7 @@ class AbstractEvolution(eqx.Module):
         return False
 
     @property
-    def growth(self) -> ArrayLike:
+    def _grows(self) -> ArrayLike:
         r"""No solution grows faster than $e^{gt}$ in the root mean square; infinite if unknown."""
         return 0.0 if self.contractive else np.inf
 

@@ -197,7 +197,7 @@ def planned(
         )  # fmt: skip
         event = _ending(event, arrays, now, told)
     saveat = _saving(saveat, arrays, now)
-    size, growth = root_mean_square(constant(u0)), jnp.asarray(constant(problem.growth), t0.dtype)
+    size, growth = root_mean_square(constant(u0)), jnp.asarray(constant(problem._grows), t0.dtype)
     # (Infinite times nothing would be no number.)
     grown = jnp.where(jnp.isfinite(growth), jnp.exp(growth * jnp.abs(t1 - t0)), jnp.inf)
     limit = jnp.where(size > 0, _GROWN * size * grown, jnp.where(jnp.isfinite(grown), 0, jnp.inf))

@@ -143,10 +143,10 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         return self.reaction is None and self.closure is None and not compressed
 
     @property
-    def growth(self):
+    def _grows(self):
         known = self.advection is not None and self.conservative
         if not known or self.reaction is not None or self.closure is not None:
-            return super().growth
+            return super()._grows
         assert self.advection is not None and self.gradient is not None
         one = jnp.ones(self.n, self.gradient.weights.dtype)
         return jnp.max(jnp.abs(self.advection(one)))  # that of the divergence

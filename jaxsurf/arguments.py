@@ -152,6 +152,57 @@ def real(
     return value
 
 
+def flag(value: Any, name: str) -> bool:
+    """True or False.
+
+    Raises:
+        TypeError: anything else, like 1, None or 'no'.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} is {_short(value)}, expected True or False")
+    return bool(value)
+
+
+def traced_call(f: Any, name: str, *args: Any) -> Any:
+    """What a function of the user's returns while JAX traces it.
+
+    Raises:
+        TypeError: it is not made of operations of JAX.
+    """
+    try:
+        return f(*args)
+    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise TypeError(
+            f"{name} needs values where JAX has only shapes: write it with jax.numpy in place of "
+            f"NumPy, and jnp.where in place of `if` ({reason})"
+        ) from error
+
+
+def pair(value: Any, name: str, what: str) -> tuple:
+    """Two things.
+
+    Raises:
+        TypeError, ValueError: anything else, with what is expected.
+    """
+    if not isinstance(value, tuple | list):
+        raise TypeError(f"{name} is {_short(value)}, expected a pair: {what}")
+    if len(value) != 2:
+        raise ValueError(f"{name} has {len(value)} parts, expected 2: {what}")
+    return tuple(value)
+
+
+def further(args: Any) -> tuple:
+    """Further arguments of a function, as a tuple.
+
+    Raises:
+        TypeError: a number or array in place of a tuple of one.
+    """
+    if not isinstance(args, tuple | list):
+        raise TypeError(f"args is {_short(args)}, expected a tuple: (value,) for one")
+    return tuple(args)
+
+
 def instance(value: Any, kinds: type | tuple[type, ...], name: str, hint: str = "") -> Any:
     """The value, which must be of one of these classes.
 
@@ -281,17 +332,17 @@ def more_digits(dtype: Any) -> str:
     return "" if dtype == jnp.float64 else ": for more digits set jax_enable_x64"
 
 
-def within_round_off(rtol: Any, dtype: Any) -> None:
+def within_round_off(rtol: Any, dtype: Any, name: str = "rtol") -> None:
     """Refuse a relative tolerance that is none, or that a precision cannot reach.
 
     Raises:
         TypeError, ValueError: with the least one there.
     """
-    real(rtol, "rtol", above=0, below=1)
+    real(rtol, name, above=0, below=1)
     least = 4 * float(jnp.finfo(dtype).eps)
     if is_concrete(rtol) and rtol < least:
         need = f"{dtype} allows at least {least:.1e}"
-        raise ValueError(f"rtol = {float(rtol):g}, {need}{more_digits(dtype)}")
+        raise ValueError(f"{name} = {float(rtol):g}, {need}{more_digits(dtype)}")
 
 
 def differentiable(f: Any, name: str, *arguments: jax.ShapeDtypeStruct) -> Any:

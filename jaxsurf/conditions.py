@@ -199,6 +199,8 @@ def robin(
         >>> js.robin([3], 1.0, a=2.0, b=0.5).m
         1
     """
+    for name, factor in (("a", a), ("b", b)):
+        as_float(factor, name)  # None means something else to a condition
     return Condition(where, value, a=a, b=b, conormals=conormals)
 
 

@@ -178,7 +178,7 @@ class Discretization(eqx.Module):
 
         Accuracy: between a fifth and four times the error of fields that vary as fast, on smooth,
             coarse and random points (`tests/test_accuracy.py`). Of normals that are wrong it tells
-            too. A plane has none but round-off.
+            too. A plane has none but round-off. In float32 within 1e-5 of it.
         Differentiable: forward and reverse, in points and normals.
 
         Example:
@@ -190,7 +190,7 @@ class Discretization(eqx.Module):
         bent = (cloud.dim - 1) * self.mean_curvature[:, None] * cloud.normals
         norm = lambda v: jnp.sqrt(jnp.sum(switched_off(self.cloud.active, v) ** 2))
         # A plane has no curvature: there round-off is told in units of the size.
-        least = norm(jnp.ones(cloud.n) / jnp.ptp(cloud.points))
+        least = norm(jnp.ones_like(cloud.points[:, 0]) / jnp.ptp(cloud.points))
         error = norm(self.laplacian(cloud.points) + bent)
         return error / jnp.maximum(norm(bent), least)
 

@@ -30,14 +30,33 @@ def interpolated(
 ) -> Float[Array, "m *c"]:
     """Values of a field at points of the surface, refused farther away than neighbours reach."""
     centers = nearest_points(cloud.points, cloud.active, points)
-    distance, reach = _distance_and_reach(cloud, neighbors, points, centers)
+    distance, reach = distance_and_reach(cloud, neighbors, points, centers)
     text = (
         "points: {i} is {v:.3g} away from the nearest point of the cloud, farther than the "
         "neighbours of that reach"
     )
     points = refuse(points, distance > reach, text, distance)
+    return read_from(cloud, neighbors, degree, points, centers, u)[0]
+
+
+def read_from(
+    cloud: PointCloud,
+    neighbors: Neighbors,
+    degree: int,
+    points: Float[Array, "m d"],
+    centers: Int[Array, " m"],
+    u: Float[Array, "n *c"],
+    *,
+    check: bool = True,
+) -> tuple[Float[Array, "m *c"], Float[Array, " m"]]:
+    """Values of a field at points, by the polynomials of these centres; residuals of the fits.
+
+    Args:
+        check: refuse fits that are not determined.
+    """
     slots, weights, residual = _interpolation_weights(cloud, neighbors, degree, points, centers)
-    return _summed(determined(weights, residual, degree), slots, u)
+    weights = determined(weights, residual, degree) if check else weights
+    return _summed(weights, slots, u), residual
 
 
 def nearest_points(
@@ -93,7 +112,7 @@ def _of_blocks(blocks, offsets, degree: int):
 
 
 @jax.jit
-def _distance_and_reach(cloud, neighbors, points, centers):
+def distance_and_reach(cloud, neighbors, points, centers):
     """How far points are from those of the cloud next to them, and how far these's lists reach."""
     x = jax.lax.stop_gradient(cloud.points)
     center = x[centers]

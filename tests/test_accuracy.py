@@ -1,5 +1,6 @@
 """Slopes and absolute errors; the long sweeps are in `experiments`."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -132,6 +133,23 @@ def test_expected_error_is_near_the_error(points, method):
     ratio = np.array(expected) / np.array(seen)
     assert np.all((ratio > 0.2) & (ratio < 4)), (expected, seen)
     assert expected[1] < expected[0] / 3
+
+
+def test_expected_error_in_single_precision():
+    """It stays in it, with the values and derivatives of double precision."""
+    cloud, method = jittered_sphere(300), js.GFDM(degree=4)
+    less = js.PointCloud(*(x.astype(jnp.float32) for x in (cloud.points, cloud.normals)))
+    surface = js.discretize(cloud, method=method)
+    single = js.discretize(less, surface.neighbors, method=method)
+    assert single.expected_error.dtype == jnp.float32
+    np.testing.assert_allclose(single.expected_error, surface.expected_error, atol=1e-5)
+    slopes = [
+        jax.grad(lambda x, s=s: s.moved(x, s.cloud.normals).expected_error)(s.cloud.points)
+        for s in (single, surface)
+    ]
+    assert slopes[0].dtype == jnp.float32
+    off = np.abs(slopes[0] - slopes[1]).max()
+    assert off < 1e-2 * np.abs(slopes[1]).max(), off
 
 
 def test_derivatives_of_the_expected_error():

@@ -112,6 +112,26 @@ def growing(t, surface, fields, args):
 
 
 @pytest.mark.slow
+def test_another_spacing_is_another_run(tmp_path):
+    """Its code is the same but for the name of a function."""
+    still = js.Motion(lambda t, surface, fields, args: 0 * surface.cloud.points)
+    spacings = [
+        lambda t, surface, fields, args: 0.35 + 0.01 * jnp.sin(surface.cloud.points[:, 0]),
+        lambda t, surface, fields, args: 0.35 + 0.01 * jnp.cos(surface.cloud.points[:, 0]),
+    ]
+
+    def run(spacing):
+        parts = js.Checkpoint(tmp_path / "run.npz", every=0.1)
+        given = dict(adapt=js.Adaptation(spacing), checkpoint=parts, method=js.GFDM(degree=2))
+        return js.evolve(still, js.sphere(150), t1=0.1, **given)
+
+    before = run(spacings[0])
+    with pytest.raises(ValueError, match="another run"):
+        run(spacings[1])
+    assert np.array_equal(run(spacings[0]).clouds[-1].points, before.clouds[-1].points)
+
+
+@pytest.mark.slow
 def test_points_are_added_while_a_sphere_grows(tmp_path, monkeypatch):
     """With room for all nothing compiles twice; a run that was killed ends in the same bits."""
     start = js.sphere(300)

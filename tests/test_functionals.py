@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsurf as js
+from jaxsurf import failures
 
 pytestmark = pytest.mark.slow
 
@@ -121,6 +122,39 @@ def test_signed_distances():
     slopes = [jax.grad(lambda y, s=s: js.signed_distance(s, y).sum())(points) for s in surfaces]
     off = [float(jnp.abs(slope - x.normals).max()) for slope in slopes]
     assert off[1] < 1e-3 and np.log2(off[0] / off[1]) > 2.8, off
+
+
+@functools.cache
+def egg():
+    return js.discretize(js.ellipsoid(300, (1.0, 0.8, 0.7)), method=js.GFDM(degree=4))
+
+
+def test_signed_distances_far_from_the_surface():
+    """Beyond radii of curvature outside, and near to centres of curvature inside."""
+    surface = egg()
+    x, n = surface.cloud.points[::10], surface.cloud.normals[::10]
+    for away in (-0.4, -0.2, 0.7, 1.0, 3.0, 1e3):
+        found = js.signed_distance(surface, x + away * n)
+        np.testing.assert_allclose(found, away, atol=2e-4)
+    np.testing.assert_allclose(js.signed_distance(surface, jnp.zeros((1, 3))), -0.7, atol=1e-4)
+
+
+def test_feet_that_are_not_found_are_refused():
+    """Near to centres of curvature: by name, and where it is asked for by NaN."""
+    cloud = js.ellipsoid(200, (1.0, 0.8, 0.7))
+    surface = js.discretize(cloud, method=js.GFDM(degree=4))
+    x, n = surface.cloud.points, surface.cloud.normals
+    near = x[:40] - 0.5 * n[:40]
+    words = "the foot of 31 is not found: the way to it leans .* off the normal, at most"
+    with pytest.raises(ValueError, match=words):
+        js.signed_distance(surface, near)
+    with pytest.raises(ValueError, match=words):
+        jax.grad(lambda y: js.signed_distance(surface, y).sum())(near)
+    with pytest.raises(Exception, match="is not found"):
+        jax.jit(lambda y: js.signed_distance(surface, y))(near)
+    with failures.marking():
+        found = jax.jit(lambda y: js.signed_distance(surface, y))(near)
+    assert np.isnan(found).all()
 
 
 def test_derivatives_of_signed_distances():

@@ -1,6 +1,7 @@
 """Shapes that minimise: constraints, folds, numbers that are none, restarts."""
 
 import functools
+import sys
 
 import jax.numpy as jnp
 import numpy as np
@@ -158,6 +159,64 @@ def test_a_run_that_goes_on_from_its_file_ends_in_the_same_bits(tmp_path):
         np.testing.assert_array_equal(again.history[name], whole.history[name])
     with pytest.raises(ValueError, match="another run"):
         axes_found(ADAM, steps=13, checkpoint=parts)
+
+
+FACTOR = 1.0
+
+
+class Weighed:
+    def __init__(self, factor):
+        self.factor = factor
+
+    def __call__(self, surface):
+        return self.factor * size(surface)
+
+
+def weighed(surface):
+    return FACTOR * size(surface)
+
+
+def recursive():
+    """A function that closes over itself."""
+    power = lambda x, n: x * power(x, n - 1) if n else 1.0
+    return lambda surface: power(size(surface), 2)
+
+
+PAIRS = {
+    "the name of a function": [lambda s: jnp.sin(size(s)), lambda s: jnp.cos(size(s))],
+    "a function within": [
+        lambda s: sum(map(lambda x: jnp.sin(x), [size(s)])),
+        lambda s: sum(map(lambda x: jnp.cos(x), [size(s)])),
+    ],
+    "a number of an object": [Weighed(1.0), Weighed(2.0)],
+    "a number of a method": [Weighed(1.0).__call__, Weighed(2.0).__call__],
+    "itself": [recursive(), weighed],
+}
+
+
+@pytest.mark.parametrize("kind", PAIRS)
+def test_another_function_is_another_run(kind, tmp_path):
+    """Where the code around is the same, too: what it computes counts."""
+    shape, path = js.MappedShape(scaled, ball()), tmp_path / "run.npz"
+
+    def run(f, **options):
+        parts = js.Checkpoint(path, every=1)
+        return js.optimize_shape(f, shape, jnp.ones(3), optimizer=ADAM, checkpoint=parts, **options)
+
+    first, second = PAIRS[kind]
+    before = run(first, steps=1)
+    with pytest.raises(ValueError, match="another run"):
+        run(second, steps=1)
+    assert np.array_equal(run(first, steps=1).theta, before.theta)
+
+
+def test_another_number_of_the_module_is_another_run(tmp_path, monkeypatch):
+    shape, parts = js.MappedShape(scaled, ball()), js.Checkpoint(tmp_path / "run.npz", every=1)
+    given = dict(optimizer=ADAM, checkpoint=parts, steps=1)
+    js.optimize_shape(weighed, shape, jnp.ones(3), **given)
+    monkeypatch.setattr(sys.modules[__name__], "FACTOR", 2.0)
+    with pytest.raises(ValueError, match="another run"):
+        js.optimize_shape(weighed, shape, jnp.ones(3), **given)
 
 
 def test_numbers_that_are_none():

@@ -165,6 +165,42 @@ def test_explicit_steps_for_waves_are_judged_on_the_imaginary_axis():
     np.testing.assert_allclose(u, np.exp(5.0), rtol=1e-6)  # what grows by itself may
 
 
+@pytest.mark.parametrize("order", [2, 3, 4])
+def test_imex_steps_whose_explicit_part_is_unstable_are_refused(order):
+    """Turning with little diffusion, and a fast reaction: 1e121 came back as a success."""
+    turn = dict(gradient=RING_GRADIENT, velocity=30 * RING_TURN)
+    problem = js.AdvectionDiffusionReaction(RING, diffusivity=1e-4, **turn)
+    solver = js.IMEX(order=order)
+    with pytest.raises(ValueError, match=r"IMEX is stable up to .* of the explicit part") as caught:
+        js.integrate(problem, NOISE, t1=20.0, dt0=0.2, solver=solver)
+    limit = float(re.findall(r"up to ([\d.e+-]+),", str(caught.value))[0])
+    u = js.integrate(problem, NOISE, t1=150 * limit, dt0=0.95 * limit, solver=solver).ys[-1]
+    assert float(jnp.abs(u).max()) < 3 * float(jnp.abs(NOISE).max())
+    with pytest.raises(ValueError, match="is unstable"):
+        js.integrate(problem, NOISE, t1=150 * limit, dt0=1.1 * limit, solver=solver)
+    decay = js.AdvectionDiffusionReaction(RING, reaction=lambda t, u, args: -500 * u)
+    quiet = js.integrate(decay, NOISE, t1=3.0, dt0=0.05, solver=solver, throw=False)
+    assert quiet.result == dfx.RESULTS.nonlinear_divergence
+    # What is treated implicitly may be as stiff as it likes.
+    u = js.integrate(RING_HEAT, NOISE, t1=6.0, dt0=1.0, solver=solver).ys[-1]
+    assert float(jnp.abs(u).max()) < float(jnp.abs(NOISE).max())
+
+
+def test_what_a_flow_compresses_grows_no_faster_than_that():
+    """RKC2's steps are not made for advection alone: they are stopped."""
+    turn = dict(gradient=RING_GRADIENT, velocity=30 * RING_TURN)
+    problem = js.AdvectionDiffusionReaction(RING, diffusivity=1e-4, **turn)
+    with pytest.raises(js.IntegrationError, match="no solution of this problem grows beyond"):
+        js.integrate(problem, NOISE, t1=40.0, dt0=0.2, solver=js.RKC2())
+    # Where it is compressed as much as that, it may: u' = u (1 + cos) at most.
+    speed = (jnp.cos(ANGLES) - 1)[:, None] * RING_TURN
+    squeezed = js.AdvectionDiffusionReaction(
+        RING, diffusivity=1e-2, gradient=RING_GRADIENT, velocity=6 * speed
+    )
+    u = js.integrate(squeezed, 1 + 0 * NOISE, t1=3.0).ys[-1]
+    assert float(u.max()) > 5
+
+
 @pytest.mark.parametrize("steps", [dict(), dict(dt0=1e-3)], ids=["adaptive", "given steps"])
 def test_what_cannot_grow_is_stopped_when_it_does(steps):
     """A traced negative diffusivity is seen by what it does; a concrete one is refused."""

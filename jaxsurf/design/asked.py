@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 
-from ..arguments import instance
+from ..arguments import instance, traced_call
 from ..time.checkpoint import Checkpoint
 from .lagrangian import CROSSED, Values
 from .outcome import COLUMNS
@@ -31,6 +33,8 @@ def constraints(given: Any, name: str) -> dict[str, Callable]:
         return {}
     instance(given, Mapping, name, '{"volume": lambda surface: js.volume(surface) - 1}, say')
     for key, f in given.items():
+        if not isinstance(key, str):
+            raise TypeError(f"{name} has the name {key!r}, expected text")
         if not callable(f):
             raise TypeError(f"{name}[{key!r}] is a {type(f).__name__}, expected a function")
     return dict(given)
@@ -48,6 +52,26 @@ def check_asked(functions, shape, optimizer, asked, checkpoint) -> None:
     for name in taken:
         if name in COLUMNS or taken.count(name) > 1:
             raise ValueError(f"a constraint is called {name!r}: that name is taken")
+
+
+def check_projection(project: Callable | None, optimizer, theta) -> None:
+    """Refuse what is no projection of parameters, and L-BFGS beside one."""
+    if project is None:
+        return
+    shapes = lambda tree: jax.tree.map(lambda x: (jnp.shape(x), jnp.result_type(x)), tree)
+    given, found = (
+        shapes(theta),
+        shapes(jax.eval_shape(lambda theta: traced_call(project, "project", theta), theta)),
+    )
+    if given != found:
+        raise ValueError(f"project returns {found} (shapes and types), expected {given}")
+    is_lbfgs = lambda x: isinstance(x, optax.ScaleByLBFGSState)
+    state = jax.eval_shape(optimizer.init, theta)
+    if any(map(is_lbfgs, jax.tree.leaves(state, is_leaf=is_lbfgs))):
+        raise ValueError(
+            "project with L-BFGS: its search along a line does not know of it; take a method of "
+            "first order, optax.adam(1e-2) say, or inequalities"
+        )
 
 
 def refuse_start(values: Values) -> None:

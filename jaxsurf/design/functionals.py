@@ -9,24 +9,29 @@ u from `js.integrate`. Users' own are functions of a discretisation too.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
-from jax.lax import fori_loop, stop_gradient
-from jaxtyping import Array, Float
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float, Int
 
 from ..arguments import as_float, finite, instance, real, switched_off
+from ..build import residual_tolerance
+from ..compiling import sized_jit
 from ..discretization import Discretization
-from ..failures import needs_values
+from ..failures import is_concrete, needs_values, refuse, without_derivatives
 from ..frames import frames_of
-from ..interpolation import nearest_points
+from ..interpolation import distance_and_reach, nearest_points, read_from
 from ..motion import crossed
 from ..solve.steady import solve
 
 # Multiple of round-off that is the tolerance of solves: gradients are as exact as they are. That of
 # the solution alone leaves a residual that grows with the number of points.
 _SOLVE = 1_000
-# Steps that lead to a foot.
-_FEET = 10
+# Steps that lead to a foot, in the first of which the local polynomial is that of the point of the
+# cloud next to it.
+_STEPS, _FOLLOWED = 40, 10
 
 
 def volume(surface: Discretization) -> Float[Array, ""]:
@@ -106,7 +111,7 @@ def compliance(
         True
     """
     _closed(surface)
-    f = as_float(f, "load", (surface.n,))
+    f = finite(as_float(f, "load", (surface.n,)), "load", surface.cloud.active)
     real(screening, "screening", least=0)
     needs_values("screening", screening, instead="give a number from outside")
     free = float(screening) == 0
@@ -161,7 +166,7 @@ def signed_distance(surface: Discretization, points: Float[Array, "m d"]) -> Flo
     Args:
         surface: from `js.discretize`, closed, with normals outwards (inwards the sign turns).
         points: y, `(m, d)`, in the units of the surface. Their feet are found where they are
-            nearer to the surface than about half of its radii of curvature.
+            nearer to the surface than to a centre of its curvature.
 
     Accuracy: error $O(h^{p+1})$ with p the polynomial degree of the method
         (`tests/test_functionals.py::test_signed_distances`); in float32 within 1e-5.
@@ -170,7 +175,9 @@ def signed_distance(surface: Discretization, points: Float[Array, "m d"]) -> Flo
     Raises:
         TypeError: what is no discretisation or array of numbers.
         ValueError: a surface with a border; points of another shape or not finite, or whose feet
-            are not found: they lie farther from the cloud than its lists reach (named by index).
+            are not found (named by index): they lie farther from the cloud than its lists reach,
+            or no way to the point is along the normal, as beyond a centre of curvature. Compiled,
+            an error of the run time.
 
     Example:
         >>> surface = js.discretize(js.sphere(500), method=js.GFDM(degree=4))
@@ -180,26 +187,112 @@ def signed_distance(surface: Discretization, points: Float[Array, "m d"]) -> Flo
     """
     _closed(surface)
     points = finite(as_float(points, "points", ("m", surface.cloud.dim)), "points")
-    x, normals = surface.cloud.seen.points, surface.cloud.seen.normals
-    nearest = nearest_points(x, surface.cloud.active, points)
-    tangents = jnp.moveaxis(frames_of(normals[nearest])[:, :-1], 1, 0)
-    along = lambda v, n: jnp.sum(v * n, axis=1, keepdims=True)
+    cloud, neighbors = surface.cloud.seen, surface.neighbors
+    degree = surface.method.polynomial_degree
+    known = (cloud, neighbors, points)
+    seen = without_derivatives(known)
+    fixed, lists, y = stop_gradient(seen if is_concrete(seen) else known)
+    nearest = nearest_points(fixed.points, cloud.active, y)
+    feet = stop_gradient(_feet(fixed, lists, y, nearest, degree))
+    text = (
+        "points: the foot of {i} is not found: it is {v:.3g} away from the nearest point of the "
+        "cloud, whose neighbours reach {reach:.3g}"
+    )
+    points = refuse(points, ~(feet.distance <= feet.reach), text, feet.distance, reach=feet.reach)
+    text = (
+        "points: the foot of {i} is not found: the way to it leans {v:.3g} off the normal, at most "
+        "{most:.1e} is allowed; it may be nearer to a centre of curvature than to the surface"
+    )
+    points = refuse(points, ~(feet.left <= feet.most), text, feet.left, most=feet.most)
+    f, n, _ = _above(cloud, neighbors, degree, feet.place, feet.center)
+    return _along(points - f, n)[:, 0]
 
-    def there(q):
-        """Position of the surface over q and the unit normal that belongs to it, exactly."""
-        read = lambda q: surface.interpolate(x, q)
-        f, moved = jax.vmap(lambda t: jax.jvp(read, (q,), (t,)), out_axes=(None, 1))(tangents)
-        n = crossed(moved)
-        return f, n / jnp.linalg.norm(n, axis=1, keepdims=True)
 
-    def nearer(_, q):
-        """Off the tangents at the last foot: what is left falls by the distance times curvature."""
-        f, n = there(q)
-        return stop_gradient(points - along(points - f, n) * n)
+class _Feet(NamedTuple):
+    """Feet of points on a surface.
 
-    start = points - along(points - x[nearest], normals[nearest]) * normals[nearest]
-    f, n = there(stop_gradient(fori_loop(0, _FEET, nearer, stop_gradient(start))))
-    return along(points - f, n)[:, 0]
+    Args:
+        place: where they are looked up, over the tangent plane of a point of the cloud,
+        center: this.
+        left: how far the way to a point is off the normal at its foot, in length.
+        most: what is allowed of it.
+        distance: of a foot from the point of the cloud,
+        reach: how far the list of that one reaches.
+    """
+
+    place: Float[Array, "m d"]
+    center: Int[Array, " m"]
+    left: Float[Array, " m"]
+    most: Float[Array, " m"]
+    distance: Float[Array, " m"]
+    reach: Float[Array, " m"]
+
+
+@sized_jit
+def _feet(cloud, neighbors, points, nearest, degree: int) -> _Feet:
+    """By Newton's method over tangent planes, with differences of normals for the curvature."""
+    small = jnp.finfo(points.dtype).eps ** (1 / 3)
+
+    def nearer(state):
+        feet, place, count = state
+        # From one local polynomial to the next there is a step, over which feet may go for ever.
+        again = nearest_points(cloud.points, cloud.active, place)
+        center = jnp.where(count < _FOLLOWED, again, feet.center)
+        tangents = _tangents(cloud, center)
+        distance, reach = distance_and_reach(cloud, neighbors, place, center)
+        beside = place + small * reach[:, None] * tangents
+        look = lambda place: _above(cloud, neighbors, degree, place, center, check=False)
+        (f, n, residual), (_, ns, _) = look(place), jax.vmap(look)(beside)
+        height = _along(points - f, n)
+        off = points - f - height * n
+        left = jnp.linalg.norm(off, axis=1)
+        # The matrix of second derivatives of half the squared distance: positive at a minimum.
+        bends = (ns - n) / (small * reach[:, None])
+        matrix = jnp.einsum("amd,bmd->mab", bends, tangents) * height[:, :, None]
+        matrix = matrix + jnp.eye(len(tangents), dtype=matrix.dtype)
+        least = jnp.trace(matrix, axis1=1, axis2=2) > 0
+        least &= jnp.linalg.det(matrix) > 0
+        step = jnp.linalg.solve(matrix, jnp.einsum("amd,md->ma", tangents, off)[..., None])
+        step = jnp.einsum("ma,amd->md", step[..., 0], tangents)
+        step = jnp.where(least[:, None], step, off)
+        length = jnp.linalg.norm(step, axis=1)
+        step = step * (reach / jnp.maximum(length, reach))[:, None]
+        # Fits that are not determined are refused where they are read.
+        good = residual < residual_tolerance(residual.dtype)
+        most = jnp.where(good, jnp.finfo(f.dtype).eps ** 0.5 * reach, jnp.inf)
+        left = jnp.where(least, left, jnp.linalg.norm(points - f, axis=1))
+        found = _Feet(place, center, left, most, distance, reach)
+        done = (found.left <= most)[:, None]
+        return found, jnp.where(done, place, f + step), count + 1
+
+    def goes_on(state):
+        feet, _, count = state
+        return jnp.any(feet.left > feet.most) & (count < _STEPS)
+
+    x = cloud.points[nearest]
+    none = jnp.zeros_like(points[:, 0])
+    first = _Feet(points, nearest, none + jnp.inf, none, none, none)
+    return jax.lax.while_loop(goes_on, nearer, (first, x, 0))[0]
+
+
+def _tangents(cloud, center) -> Float[Array, "t m d"]:
+    return jnp.moveaxis(frames_of(cloud.normals[center])[:, :-1], 1, 0)
+
+
+def _above(cloud, neighbors, degree: int, place, center, *, check: bool = True):
+    """The surface over some places, the unit normals that belong to it, residuals of the fits."""
+    x = cloud.points
+    read = lambda q: read_from(cloud, neighbors, degree, q, center, x, check=check)
+    along = lambda t: jax.jvp(read, (place,), (t,))
+    (f, residual), (moved, _) = jax.vmap(along, out_axes=((None, None), (1, None)))(
+        _tangents(cloud, center)
+    )
+    n = crossed(moved)
+    return f, n / jnp.linalg.norm(n, axis=1, keepdims=True), residual
+
+
+def _along(v, n):
+    return jnp.sum(v * n, axis=1, keepdims=True)
 
 
 def _closed(surface):

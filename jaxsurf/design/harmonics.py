@@ -7,11 +7,16 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..arguments import as_float, instance, shaped, whole
 from ..discretization import Discretization
+from ..failures import check
 from .shape import MappedShape
+
+# How far the length of a direction may be from one.
+_UNIT = 1e-5
 
 
 def spherical_harmonics(directions: Float[Array, "*n 3"], degree: int) -> Float[Array, "*n m"]:
@@ -33,7 +38,7 @@ def spherical_harmonics(directions: Float[Array, "*n 3"], degree: int) -> Float[
     Differentiable: forward and reverse, to any order.
     Raises:
         TypeError: a degree that is no whole number, directions that are no real numbers.
-        ValueError: a degree below 0, directions of another shape.
+        ValueError: a degree below 0, directions of another shape or, concrete, not of length one.
     Source: Sloan 2013, Efficient spherical harmonic evaluation, in other words.
 
     Example:
@@ -42,7 +47,11 @@ def spherical_harmonics(directions: Float[Array, "*n 3"], degree: int) -> Float[
         True
     """
     directions = as_float(directions, "directions", (..., 3))
-    return _harmonics(directions, whole(degree, "degree", least=0))
+    degree = whole(degree, "degree", least=0)
+    rows = directions.reshape(-1, 3)
+    off = lambda x: ~(np.abs(np.linalg.norm(x, axis=1) - 1) < _UNIT)
+    check(rows, off, "direction {i} is {v}, expected one of length 1")
+    return _harmonics(directions, degree)
 
 
 @functools.partial(jax.jit, static_argnums=1)

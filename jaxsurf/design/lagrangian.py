@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..arguments import as_float
+from ..arguments import as_float, traced_call
 from ..compiling import sized_jit
 from ..discretization import Discretization
 from ..failures import marking
+from ..functions import Traced, canonical
 from ..motion import judged, unreached
 from .crossing import crosses
 from .shape import AbstractShape
@@ -77,7 +78,7 @@ class Problem(eqx.Module):
 
     def measured(self, surface: Discretization) -> tuple[Array, dict, dict]:
         """Objective, equalities and inequalities."""
-        value = lambda f, name: as_float(f(surface, *self.args), name)
+        value = lambda f, name: as_float(traced_call(f, name, surface, *self.args), name)
         each = lambda some: {name: value(f, f"constraint {name!r}") for name, f in some.items()}
         return value(self.objective, "objective"), each(self.equalities), each(self.inequalities)
 
@@ -198,6 +199,13 @@ def started(optimizer, theta):
 def strong(tree: PyTree) -> PyTree:
     """The same arrays, none of them weakly typed: what comes out can go in again."""
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.asarray(x).dtype), tree)
+
+
+def computed(problem: Problem, theta: PyTree) -> list[Traced]:
+    """What the user's functions compute, as programs, which tell them apart."""
+    measured = lambda theta: problem.measured(problem.shape(theta))
+    with marking():
+        return [canonical(f, theta) for f in (measured, problem.projected)]
 
 
 def kinds(problem: Problem, theta: PyTree) -> tuple:

@@ -19,7 +19,16 @@ from ..discretization import Discretization
 from ..renew import NeighborSearch
 from ..time.checkpoint import Checkpoint, digest, read_back, written
 from .asked import FAR, ILL, refuse_start
-from .lagrangian import Multipliers, Problem, Values, direction, evaluated, kinds, started
+from .lagrangian import (
+    Multipliers,
+    Problem,
+    Values,
+    computed,
+    direction,
+    evaluated,
+    kinds,
+    started,
+)
 from .outcome import COLUMNS, ShapeOptimization
 from .shape import AbstractShape, unchecked_surface, with_wear
 
@@ -124,7 +133,8 @@ class Loop(NamedTuple):
         run = self.first(problem, shape, theta)
         file = None
         if self.checkpoint is not None:
-            told = digest((self._replace(callback=None, checkpoint=None), shape, theta))
+            known = (self._replace(callback=None, checkpoint=None), shape, theta)
+            told = digest((known, computed(problem, theta)))
             file = _File(Path(self.checkpoint.path), max(1, round(self.checkpoint.every)), told)
             run = file.read(run)
             shape = eqx.combine(run.lists, shape)

@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 import optax
 from jaxtyping import Array, Float, PyTree
 
-from ..arguments import floating, real, whole
+from ..arguments import flag, floating, further, real, whole
 from ..failures import needs_values
 from ..time.checkpoint import Checkpoint
-from .asked import check_asked, constraints
+from .asked import check_asked, check_projection, constraints
 from .lagrangian import strong
 from .loop import Loop
 from .outcome import OptimizationError, ShapeOptimization
@@ -56,7 +56,8 @@ def optimize_shape(
             best of size one, like `lambda s: js.volume(s) - 1`.
         inequalities: $g(S) \le 0$, likewise.
         project: takes parameters to the nearest that are allowed, at the start and after every
-            step of a first-order method: one of `optax.projections`, say.
+            step of a first-order method: one of `optax.projections`, say. L-BFGS is refused: its
+            search along a line does not know of it.
         args: further arguments of all these; other values compile nothing, where other
             functions do.
         steps: at most.
@@ -102,16 +103,17 @@ def optimize_shape(
     asked = constraints(equalities, "equalities"), constraints(inequalities, "inequalities")
     functions = dict(objective=objective, project=project, callback=callback)
     check_asked(functions, shape, optimizer, asked, checkpoint)
-    theta = strong(floating(theta, "theta"))
+    theta, args = strong(floating(theta, "theta")), further(args)
+    check_projection(project, optimizer, theta)
     numbers = dict(
         steps=whole(steps, "steps", least=1),
         rtol=real(rtol, "rtol", least=0),
         ctol=real(ctol, "ctol", above=0),
         penalty=None if penalty is None else real(penalty, "penalty", above=0),
-        renew=bool(renew),
+        renew=flag(renew, "renew"),
     )
     needs_values("theta, shape, args and tolerances", theta, shape, args, numbers)
-    loop = Loop(objective, *asked, project, tuple(args), optimizer, numbers, callback, checkpoint)
+    loop = Loop(objective, *asked, project, args, optimizer, numbers, callback, checkpoint)
     found, failed = loop.run(shape, theta)
     if failed and throw:
         raise OptimizationError(found.stopped, found)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..arguments import as_float, differentiable, instance, switched_off
+from ..arguments import as_float, differentiable, finite, instance, pair, switched_off
 from ..compiling import sized_jit
 from ..discretization import Discretization
 from ..failures import check, marking, not_positive
@@ -120,7 +120,7 @@ class MappedShape(AbstractShape):
 
     def __call__(self, theta: PyTree) -> Discretization:
         if isinstance(self.base, AbstractShape):
-            own, theta = theta
+            own, theta = pair(theta, "theta", "parameters of the shape and of the map")
             surface = self.base(own)
         else:
             surface = self.base
@@ -179,7 +179,8 @@ class NormalShape(AbstractShape):
     def __init__(self, surface: Discretization, start: Float[Array, " n"] | None = None):
         check_surface(surface)
         start = jnp.zeros_like(surface.cloud.points[:, 0]) if start is None else start
-        self.surface, self.start = surface, as_float(start, "start", (surface.n,))
+        self.surface = surface
+        self.start = finite(as_float(start, "start", (surface.n,)), "start", surface.cloud.active)
 
     def __call__(self, theta: Float[Array, " n"]) -> Discretization:
         theta = as_float(theta, "displacements", (self.surface.n,))
@@ -216,7 +217,7 @@ def rigid_motion(
         [0.0, 1.0, 1.0]
     """
     x = as_float(x, "x", (2,), (3,))
-    turn, shift = theta
+    turn, shift = pair(theta, "theta", "a rotation and a shift")
     turn = as_float(turn, "rotation", () if len(x) == 2 else (3,))
     shift = as_float(shift, "shift", x.shape)
     if len(x) == 2:

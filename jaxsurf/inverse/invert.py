@@ -14,7 +14,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ..arguments import as_float, floating, instance, real, whole
+from ..arguments import as_float, floating, further, instance, real, traced_call, whole
 from ..design.lagrangian import started, strong
 from ..design.outcome import OptimizationError
 from ..failures import needs_values, raise_at
@@ -185,10 +185,13 @@ def solve_inverse(
     steps = whole(steps, "steps", least=1)
     linear_steps = whole(linear_steps, "linear_steps", least=1)
     needs_values("theta, data, noise, prior and args", theta, data, noise, prior, args)
-    theta = strong(floating(theta, "theta"))
+    theta, args = strong(floating(theta, "theta")), further(args)
     prior = _priors(prior, theta)
+    for name, given in (("data", data), ("noise", noise)):
+        if not jax.tree.leaves(given):
+            raise TypeError(f"{name} is {given!r}, expected numbers")
     data = jax.tree.map(lambda d: as_float(d, "data"), data)
-    problem = Problem(forward, tuple(args), data, noise, prior, jax.tree.map(jnp.ones_like, theta))
+    problem = Problem(forward, args, data, noise, prior, jax.tree.map(jnp.ones_like, theta))
     problem = _with_noise(problem, theta)
     dtype = jnp.result_type(*jax.tree.leaves(theta))
     tol = (1e-3 if jnp.finfo(dtype).bits > 32 else 0.05) if tol is None else tol
@@ -296,11 +299,16 @@ def _priors(prior, theta) -> PyTree:
 
 def _with_noise(problem: Problem, theta) -> Problem:
     """With standard deviations for all data, which the model has to predict."""
-    predicted = eqx.filter_eval_shape(problem.forward, theta, *problem.args)
+    predicted = eqx.filter_eval_shape(traced_call, problem.forward, "forward", theta, *problem.args)
+    if not jax.tree.leaves(predicted):
+        raise TypeError(f"forward returns {predicted!r}, expected arrays like the data")
     have, want = _structure(problem.data), _structure(predicted)
     if have != want:
         raise ValueError(f"data have the structure {have}, forward returns {want}")
     for d, f in zip(jax.tree.leaves(problem.data), jax.tree.leaves(predicted)):
+        if not jnp.issubdtype(getattr(f, "dtype", object), jnp.floating):
+            kind = getattr(f, "dtype", type(f).__name__)
+            raise TypeError(f"forward returns {kind}, expected floating-point numbers")
         if d.shape != f.shape:
             raise ValueError(f"data have shape {d.shape}, forward returns {f.shape}")
         raise_at(~np.isfinite(d).ravel(), "datum {i} is {v}, expected a number", np.ravel(d))

@@ -17,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, PyTree
 
+from ..arguments import traced_call, whole
 from ..compiling import sized_jit
 from .problem import Problem, each, jacobian
 
@@ -62,9 +63,16 @@ class Posterior(eqx.Module):
 
         Args:
             quantity: of unknowns like `mean`; returns an array of few numbers.
+
+        Raises:
+            TypeError: a quantity that is no function to such an array.
         """
+        found = jax.eval_shape(lambda x: traced_call(quantity, "quantity", x), self.mean)
+        if not jnp.issubdtype(getattr(found, "dtype", object), jnp.floating):
+            what = getattr(found, "dtype", type(found).__name__)
+            raise TypeError(f"quantity returns {what}, expected an array of floating-point numbers")
         rows = jax.jacrev(lambda xi: quantity(self.problem.theta(xi)))(self.xi)
-        shape = jax.eval_shape(quantity, self.mean).shape
+        shape = found.shape
         rows = jax.tree.map(lambda a: a.reshape(-1, *a.shape[len(shape) :]), rows)
         flat = jax.vmap(lambda row: ravel_pytree(row)[0])(rows)
         before = jnp.sum((flat * self.known) ** 2, axis=1)
@@ -79,7 +87,7 @@ class Posterior(eqx.Module):
             key: of `jax.random`.
             count: how many.
         """
-        return _samples(self, key, count)
+        return _samples(self, key, whole(count, "count", least=1))
 
 
 def posterior_of(problem: Problem, xi: PyTree, mean: PyTree) -> Posterior:

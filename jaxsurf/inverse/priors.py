@@ -77,11 +77,25 @@ class GaussianPrior(AbstractPrior):
         check(self.deviation, not_positive, text)
         check(self.mean, lambda x: ~np.isfinite(x), "mean {v:g} of unknown {i} is not finite{more}")
 
+        try:
+            jnp.broadcast_shapes(self.deviation.shape, self.mean.shape)
+        except ValueError:
+            raise ValueError(
+                f"mean has shape {self.mean.shape}, the deviation {self.deviation.shape}"
+            ) from None
+
     def color(self, xi):
+        xi = self._fitting(xi, "xi")
         return (self.mean + self.deviation * xi).astype(jnp.result_type(xi))
 
     def whiten(self, theta):
+        theta = self._fitting(theta, "theta")
         return ((theta - self.mean) / self.deviation).astype(jnp.result_type(theta))
+
+    def _fitting(self, x, name: str):
+        x = as_float(x, name)
+        own = jnp.broadcast_shapes(self.deviation.shape, self.mean.shape)
+        return shaped(x, name, own) if own else x
 
     def variance(self, theta):
         deviation = jnp.broadcast_to(self.deviation, jnp.shape(theta))
@@ -154,6 +168,7 @@ class MaternPrior(AbstractPrior):
         self.mean = known.astype(self.mass.dtype)
 
     def color(self, xi):
+        xi = as_float(xi, "xi", (*self.mass.shape, ...))
         mass = switched_off(self.operator.active, self.mass, 1)
         noise = switched_off(self.operator.active, xi / jnp.sqrt(mass)) / self.tau
         return self.mean + self._solved(noise)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
-from ..arguments import as_float, finite, instance, real, switched_off, whole
+from ..arguments import as_float, finite, flag, instance, real, switched_off, whole
 from ..discretization import Discretization, discretize
 from ..failures import needs_values, raise_at
 from ..interpolation import interpolated, nearest_points
@@ -88,7 +88,7 @@ class Adaptation(eqx.Module):
                 "three quarters of hole: points put into holes would be merged again"
             )
         self.every = None if every is None else float(real(every, "every", above=0))
-        self.conserve = bool(instance(conserve, (bool, np.bool_), "conserve"))
+        self.conserve = flag(conserve, "conserve")
         self.capacity = None if capacity is None else whole(capacity, "capacity", least=1)
 
     def at(self, t, surface: Discretization, fields, args) -> Float[np.ndarray, " n"]:

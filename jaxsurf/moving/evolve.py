@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ..arguments import as_float, finite, instance, real, switched_off
+from ..arguments import as_float, as_many, finite, instance, real, switched_off
 from ..cloud import PointCloud
 from ..discretization import Discretization, discretize
 from ..failures import is_concrete, raise_at, refuse
@@ -22,6 +22,7 @@ from ..stencils.method import AbstractMethod
 from ..stencils.usual import USUAL
 from ..time.asked import check_coefficients
 from ..time.checkpoint import Checkpoint
+from ..time.higher import WaveEquation
 from ..time.integrate import integrate
 from ..time.problem import AbstractEvolution, checked_problem
 from .adaptation import Adaptation, checked_adaptation
@@ -203,7 +204,8 @@ def evolve(
                 f"problem is a {type(problem).__name__}, expected a function of the surface: "
                 "lambda surface: js.AdvectionDiffusionReaction(surface.laplacian), say"
             )
-        check_coefficients(checked_problem(problem(surface)), t0, t1)
+        _check_problem(checked_problem(problem(surface)), fields, surface.n)
+        check_coefficients(problem(surface), t0, t1)
     options = dict(solver=solver, dt0=dt0, rtol=rtol, atol=atol, args=args)
     moving, state = Moving.of(surface, motion, problem), joined(surface.cloud.points, fields)
     if checkpoint is not None:
@@ -213,6 +215,17 @@ def evolve(
             *followed(moving, state, t0, times, options, adapt, contact, checkpoint, progress)
         )
     return _kept(moving, state, t0, times, options)
+
+
+def _check_problem(made: AbstractEvolution, fields, n: int) -> None:
+    """Refuse one of other points or fields than there are."""
+    if made.n is not None:
+        as_many("problem makes operators", made.n, "the surface", n)
+    if not jax.tree.leaves(fields):
+        raise ValueError("problem is given, but no fields: fields = () has 0 arrays, at least 1")
+    if isinstance(made, WaveEquation) and not (isinstance(fields, tuple) and len(fields) == 2):
+        kind = type(fields).__name__
+        raise ValueError(f"fields is a {kind}, a wave needs 2 arrays: values and velocities")
 
 
 def _discretized(motion, cloud, method) -> Discretization:
@@ -242,6 +255,8 @@ def _times(t0, t1, saveat) -> list:
     """When to save, t1 last."""
     for name, value in (("t0", t0), ("t1", t1)):
         real(value, name)
+    if isinstance(saveat, str) or not (saveat is None or np.iterable(saveat)):
+        raise TypeError(f"saveat is a {type(saveat).__name__}, expected a sequence of times")
     saved = [] if saveat is None else list(saveat)
     for value in saved:
         real(value, "saveat")

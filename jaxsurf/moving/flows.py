@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from ..arguments import instance
+from ..arguments import flag
 from ..discretization import Discretization
 from ..stencils.algebra import AbstractOperator
 from .motions import AbstractMotion
@@ -34,7 +33,7 @@ class MeanCurvatureFlow(AbstractMotion):
     keep_volume: bool = eqx.field(static=True)
 
     def __init__(self, keep_volume: bool = False):
-        self.keep_volume = bool(instance(keep_volume, (bool, np.bool_), "keep_volume"))
+        self.keep_volume = flag(keep_volume, "keep_volume")
 
     @property
     def derivatives(self):

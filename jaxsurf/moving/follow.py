@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from ..arguments import is_array
 from ..discretization import Discretization, discretize
+from ..functions import canonical
 from ..motion import stretch, unreached
 from ..neighbors import Neighbors
 from ..normals import refit_normals
@@ -151,6 +152,10 @@ def _digest(moving: Moving, state, start, times, options, kinds, checkpoint: Che
     """Of all that a run hangs on; functions by what they compute."""
     unset = dict.fromkeys(("controller", "saveat", "event", "adjoint", "max_steps"))
     plan = planned(moving, state, start, times[-1], **options, **unset, progress=False, throw=True)
+    adapt = kinds[0]
+    if adapt is not None and callable(adapt.spacing):
+        known = (moving.surface, parted(state)[1], options["args"])
+        kinds = (*kinds, canonical(adapt.spacing, jnp.asarray(start), *known))
     return digest((checkpoint.every, times, moving.surface.neighbors, kinds, plan.run))
 
 
@@ -272,7 +277,12 @@ class _Run:
             with contextlib.suppress(ValueError):
                 found = surface.moved(cloud.points, cloud.normals, search=self.search)
         if found is None:
-            found = discretize(cloud, method=surface.method)
+            try:
+                found = discretize(cloud, method=surface.method)
+            except ValueError as error:
+                raise ValueError(
+                    f"at t = {float(self.t):g} neighbours could not be found anew: {error}"
+                ) from error
             self.search = found.search()
         self.moving = Moving.of(found, self.moving.motion, self.moving.on)
         self.watch()

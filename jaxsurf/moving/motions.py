@@ -9,7 +9,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, ArrayLike, PyTree
 
-from ..arguments import real
+from ..arguments import real, traced_call
 from ..discretization import Discretization
 from ..failures import is_concrete
 from ..functions import numbers_as_arrays
@@ -89,7 +89,7 @@ class Motion(AbstractMotion):
         self.function = velocity
 
     def velocity(self, t, surface, fields, args):
-        return self.function(t, surface, fields, args)
+        return traced_call(self.function, "velocity", t, surface, fields, args)
 
 
 class MotionSum(AbstractMotion):

@@ -95,7 +95,8 @@ def eigenmodes(
     Raises:
         TypeError: what is no operator or closure; a k that is no whole number.
         ValueError: an operator with components; k < 1 or too many modes for the points; a
-            border without conditions, which gives modes that grow; a group that goes on beyond
+            border without conditions, which gives modes that grow; an operator whose
+            eigenvalues are positive; a group that goes on beyond
             the modes computed.
         RuntimeError: the iteration has not converged.
 
@@ -193,6 +194,12 @@ def _subspace(system: _System, k: int, degenerate: float, *, left: bool) -> Subs
 
     def compute(system, reference):
         matrix, free = system.to_scipy()
+        mean = matrix.diagonal().mean()
+        if mean < 0:
+            raise ValueError(
+                f"the eigenvalues of the operator have the mean {-mean:.3g}, expected one below 0, "
+                "as of a Laplacian: modes are those of minus it. Give -operator"
+            )
         space = invariant.subspace(matrix, reference[free].astype(float), k, degenerate, left=left)
         return _spread(space, free, n, reference.dtype)
 

@@ -13,7 +13,15 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ..arguments import as_float, finite, more_digits, precision_of, switched_off, whole
+from ..arguments import (
+    as_float,
+    finite,
+    more_digits,
+    precision_of,
+    switched_off,
+    traced_call,
+    whole,
+)
 from ..boundary import Closure
 from ..compiling import sized_jit
 from ..failures import is_concrete, refuse
@@ -105,7 +113,7 @@ def solve_nonlinear(
     u0 = switched_off(operator.active, u0)
     if rhs.ndim:
         rhs = switched_off(operator.active, rhs)
-    given = jax.eval_shape(lambda u: reaction(u, args), u0)
+    given = jax.eval_shape(lambda u: traced_call(reaction, "reaction", u, args), u0)
     if getattr(given, "shape", None) != u0.shape:
         shape = getattr(given, "shape", type(given).__name__)
         raise ValueError(f"reaction returns {shape}, expected an array of shape {u0.shape}")

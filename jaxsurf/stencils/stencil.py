@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import struct
 import zipfile
 import zlib
@@ -15,7 +16,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import is_array, mask, point_indices, shaped, switched_off
+from ..arguments import instance, is_array, mask, point_indices, shaped, switched_off
 from ..failures import check, is_concrete, unchecked
 from .algebra import AbstractOperator, Transposed, per_point
 from .gathers import product
@@ -154,7 +155,7 @@ class Stencil(AbstractOperator):
             return unchecked(Stencil, *fields)
         if isinstance(other, AbstractOperator) or self.in_shape or not self._starts_with_centers:
             return super().__add__(other)
-        return self._with(self.weights.at[0].add(self._own(other, "term")))
+        return self._with(jnp.asarray(self.weights).at[0].add(self._own(other, "term")))
 
     def _own(self, value, name: str):
         """A number or one number per point, in the precision of the weights."""
@@ -184,6 +185,7 @@ class Stencil(AbstractOperator):
 
     def save(self, path: str | Path) -> None:
         """Write indices and weights to a NumPy archive (`.npz`, no pickle)."""
+        instance(path, (str, os.PathLike), "path")
         data = {
             "indices": np.asarray(self.indices),
             "weights": np.asarray(self.weights),

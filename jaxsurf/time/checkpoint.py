@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import CodeType
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -41,7 +42,7 @@ class Checkpoint(eqx.Module):
 
     Raises:
         TypeError: a path or a time that is none.
-        ValueError: a time that is not positive.
+        ValueError: a time that is not positive, a folder that is not there.
 
     Example:
         >>> cloud = js.sphere(300)
@@ -59,6 +60,10 @@ class Checkpoint(eqx.Module):
     def __init__(self, path: str | Path, every: float):
         if not isinstance(path, str | os.PathLike):
             raise TypeError(f"path is a {type(path).__name__}, expected the path of a file")
+        if not Path(path).absolute().parent.is_dir():
+            raise ValueError(
+                f"path is {str(path)!r}: there is no folder {str(Path(path).parent)!r}"
+            )
         self.path, self.every = Path(path), float(real(every, "every", above=0))
 
 
@@ -170,8 +175,12 @@ def _joined(
 # --- the file ------------------------------------------------------------------------------
 
 
-def digest(content: PyTree) -> str:
-    """Of all numbers, of all that is static, and of what functions compute."""
+def digest(content: PyTree, within: tuple = ()) -> str:
+    """Of all numbers, of all that is static, and of what functions compute.
+
+    Args:
+        within: functions whose surroundings this is, which may hold them again.
+    """
     found = hashlib.sha256()
     leaves, structure = jax.tree.flatten(content)
     for leaf in leaves:
@@ -179,19 +188,30 @@ def digest(content: PyTree) -> str:
             leaf = np.asarray(leaf)
             found.update(f"{leaf.dtype}{leaf.shape}".encode() + leaf.tobytes())
         else:
-            found.update(_described(leaf).encode())
+            found.update(_described(leaf, within).encode())
     found.update(_without_addresses(str(structure)).encode())
     return found.hexdigest()
 
 
-def _described(value: Any) -> str:
-    """Something that is no array, with the code and the surroundings of a function."""
+def _described(value: Any, within: tuple) -> str:
+    """Something that is no array, with the code and the surroundings of a function.
+
+    What functions read of their module is not among these: where it counts, the caller adds the
+    program that they are (`functions.canonical`).
+    """
     code = getattr(value, "__code__", None)
-    if code is None:
+    if code is None or any(value is other for other in within):
         return _without_addresses(repr(value))
     cells = [cell.cell_contents for cell in value.__closure__ or ()]
-    inside = digest((cells, value.__defaults__)) if cells or value.__defaults__ else ""
-    return _without_addresses(f"{value.__qualname__}{code.co_code!r}{code.co_consts}{inside}")
+    inside = (cells, value.__defaults__, getattr(value, "__self__", None))
+    known = digest(inside, (*within, value))
+    return _without_addresses(f"{value.__qualname__}{_told(code)}{known}")
+
+
+def _told(code: CodeType) -> str:
+    """What a function does, with the names that it uses and the functions within it."""
+    constants = [_told(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
+    return f"{code.co_code!r}{code.co_names}{constants}"
 
 
 def _without_addresses(text: str) -> str:

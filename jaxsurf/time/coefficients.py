@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
@@ -68,22 +67,6 @@ def function(value: Any, name: str) -> Callable | None:
     if value is not None and not callable(value):
         raise TypeError(f"{name} is a {type(value).__name__}, expected a function or None")
     return value
-
-
-def user(f: Callable, name: str, *args) -> Any:
-    """What a function of the user's returns.
-
-    Raises:
-        TypeError: it is not made of operations of JAX.
-    """
-    try:
-        return f(*args)
-    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
-        reason = str(error).splitlines()[0]
-        raise TypeError(
-            f"{name} needs values where JAX has only shapes: write it with jax.numpy in place of "
-            f"NumPy, and jnp.where in place of `if` ({reason})"
-        ) from error
 
 
 def check_operator(

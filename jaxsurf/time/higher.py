@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from ..arguments import traced_call as user
 from ..boundary import Closure
 from ..stencils.algebra import AbstractOperator
 from .coefficients import (
@@ -20,7 +21,6 @@ from .coefficients import (
     coefficient,
     function,
     number,
-    user,
 )
 from .implicit import IMEX
 from .problem import AbstractEvolution, at_time, balanced, homogeneous, per_point, same_shape

@@ -167,6 +167,11 @@ class IMEX(_Implicit):
     ):
         self._set(order, _IMEX, solver, tolerance, preconditioner)
 
+    @property
+    def tableau(self) -> Tableau:
+        """Its coefficients."""
+        return _IMEX[self.scheme]
+
     def func(self, terms, t0, y0, args):
         return added(*(term.vf(t0, y0, args) for term in terms.terms))
 
@@ -179,7 +184,7 @@ class IMEX(_Implicit):
         span = implicit.contr(t0, t1)
         solver = relative(self.solver, self.tolerance, y0)
 
-        tableau = _IMEX[self.scheme]
+        tableau = self.tableau
         options = _options(self.preconditioner, tableau.gamma * (t1 - t0))
 
         def solve(t, known, start):

@@ -227,11 +227,14 @@ def _unstable(name: str, run: Run, verdict: Verdict) -> str:
     assert run.tableau is not None and run.dt0 is not None
     dt, span = abs(float(run.dt0)), abs(float(run.t1 - run.t0))
     limit, radius = verdict.longest(run.tableau, dt, span)
+    split = len(verdict.projected) > 1
+    what = "explicit part of the right-hand side" if split else "right-hand side"
+    others = "" if split else ", or js.RKC2() or js.IMEX()"
     return (
         f"dt0 = {dt:g} is unstable: {name} is stable up to {limit:.3g}, the spectral radius of the "
-        f"right-hand side is {radius:.3g}; longer steps multiply its fastest mode by "
-        f"{float(jnp.exp(verdict.excess)):.3g} each. Shorter steps, no dt0 (steps are then "
-        "adapted), or js.RKC2() or js.IMEX()"
+        f"{what} is {radius:.3g}; longer steps multiply its fastest mode by "
+        f"{float(jnp.exp(verdict.excess)):.3g} each. Shorter steps, or no dt0 (steps are then "
+        f"adapted){others}"
     )
 
 
@@ -263,7 +266,7 @@ def _reason(plan: Plan, run: Run, solution: dfx.Solution, t: float, state) -> st
     if reason is None:
         reason = f"a linear system was not solved ({dfx.RESULTS[solution.result]})"  # type: ignore[misc]
     if float(run.limit) < jnp.inf:
-        reason += f" (no solution of this problem grows, and this one would be > {run.limit:.3g})"
+        reason += f" (no solution of this problem grows beyond {run.limit:.3g})"
     return (
         f"{plan.name} stopped at t = {t:.6g} of {float(run.t1):.6g}: {reason}. "
         f"{steps} steps were accepted and {rejected} refused; the last good state has values up to "

@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..arguments import as_float, instance
+from ..arguments import traced_call as user
 from ..boundary import Closure
 from ..failures import is_concrete
 from ..stencils.algebra import AbstractOperator
-from .coefficients import InTime, user
+from .coefficients import InTime
 from .implicit import IMEX
 from .states import added, only_on
 
@@ -64,6 +65,11 @@ class AbstractEvolution(eqx.Module):
     def contractive(self) -> bool:
         """True if no solution grows in the root mean square."""
         return False
+
+    @property
+    def _grows(self) -> ArrayLike:
+        r"""No solution grows faster than $e^{gt}$ in the root mean square; infinite if unknown."""
+        return 0.0 if self.contractive else np.inf
 
     @property
     def active(self) -> Bool[Array | np.ndarray, " n"] | None:

@@ -23,7 +23,7 @@ from .explicit import RKC2
 from .guard import Guard, guarded
 from .phases import Linear, Rest
 from .problem import AbstractEvolution, checked_problem
-from .stability import Tableau, Verdict, check_steps, tableau_of
+from .stability import Additive, Tableau, Verdict, check_steps, tableau_of
 from .states import Norm, root_mean_square
 
 _log = logging.getLogger(__name__)
@@ -89,10 +89,13 @@ class Run(eqx.Module):
         return eqx.tree_at(lambda run: (run.u0, run.t0, run.t1, run.saveat), self, new)
 
     @property
-    def tableau(self) -> Tableau | None:
-        """Of the steps, if they are explicit and of given length: these can be unstable."""
+    def tableau(self) -> Tableau | Additive | None:
+        """Of the steps, if they are explicit, in part or whole, and of given length: these can be
+        unstable. (Where geometry is in the state, that the surface folds tells.)"""
         adaptive = isinstance(self.controller, dfx.AbstractAdaptiveStepSizeController)
-        return None if adaptive or self.dt0 is None else tableau_of(self.solver)
+        is_linear = lambda x: isinstance(x, Linear)
+        moving = any(map(is_linear, jax.tree.leaves(self.terms, is_leaf=is_linear)))
+        return None if adaptive or self.dt0 is None or moving else tableau_of(self.solver)
 
 
 class Plan(NamedTuple):
@@ -117,8 +120,9 @@ def solve(run: Run) -> tuple[dfx.Solution, Verdict | None]:
     verdict, refused = None, jnp.asarray(False)
     if run.tableau is not None:
         span = run.t1 - run.t0
-        rate = run.terms.vf
-        verdict = check_steps(run.tableau, rate, run.t0, run.u0, run.args, run.dt0, span)
+        parts = run.terms.terms if isinstance(run.terms, dfx.MultiTerm) else (run.terms,)
+        rates = tuple(part.vf for part in parts)
+        verdict = check_steps(run.tableau, rates, run.t0, run.u0, run.args, run.dt0, span)
         refused = ~verdict.stable
     solution = dfx.diffeqsolve(
         run.terms,
@@ -176,6 +180,7 @@ def planned(
         controller = dfx.PIDController(rtol, atol, dtmin=shortest, force_dtmin=False)
     elif controller is None:
         controller = dfx.ConstantStepSize()
+    _check_tolerances(controller, t0.dtype)
     saveat = check_saves(dfx.SaveAt(t1=True) if saveat is None else saveat, t0, t1)
     allowed = _allowed(max_steps, saveat, t0, t1, dt0, controller)
     check_coefficients(problem, t0, t1)
@@ -192,14 +197,29 @@ def planned(
         )  # fmt: skip
         event = _ending(event, arrays, now, told)
     saveat = _saving(saveat, arrays, now)
-    size = root_mean_square(constant(u0))
-    limit = _GROWN * size if problem.contractive else jnp.asarray(jnp.inf, t0.dtype)
+    size, growth = root_mean_square(constant(u0)), jnp.asarray(constant(problem._grows), t0.dtype)
+    # (Infinite times nothing would be no number.)
+    grown = jnp.where(jnp.isfinite(growth), jnp.exp(growth * jnp.abs(t1 - t0)), jnp.inf)
+    limit = jnp.where(size > 0, _GROWN * size * grown, jnp.where(jnp.isfinite(grown), 0, jnp.inf))
     parts = (terms, solver, t0, t1, dt0, u0, args, controller, limit, saveat, event, adjoint)
     concrete = is_concrete(parts, jnp.zeros(()) + 0)  # also not inside a `jit`
     _log.info("%s over [%s, %s] by %s", type(problem).__name__, t0, t1, why)
     throw = bool(throw) and not concrete and not is_marking()
     run = Run(*parts, allowed, bool(progress), throw)
     return Plan(run, name, f"{name}: given" if why == "given" else why, concrete)
+
+
+def _check_tolerances(controller: dfx.AbstractStepSizeController, dtype) -> None:
+    """Refuse those that no step meets: it would be tried ever shorter, for ever."""
+    if not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
+        return
+    numbers: dict[str, Any] = {name: getattr(controller, name, None) for name in ("rtol", "atol")}
+    for name, value in numbers.items():
+        if value is None or not is_concrete(value) or jnp.ndim(value):
+            return
+        real(value, f"controller.{name}", least=0)
+    if not numbers["atol"] > 0:
+        within_round_off(numbers["rtol"], dtype, "controller.rtol")
 
 
 _LIKE = dict(

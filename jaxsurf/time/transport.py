@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..arguments import as_float, finite, instance, switched_off
+from ..arguments import as_float, finite, flag, instance, switched_off
+from ..arguments import traced_call as user
 from ..boundary import Closure
 from ..failures import is_concrete
 from ..operators import divergence_of
@@ -24,7 +25,6 @@ from .coefficients import (
     check_operator,
     coefficient,
     function,
-    user,
 )
 from .explicit import RKC2
 from .implicit import IMEX
@@ -118,7 +118,7 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         self.laplacian = laplacian
         self.diffusivity = coefficient(diffusivity, "diffusivity", 0, on)
         self.reaction, self.stabilization = function(reaction, "reaction"), stabilization
-        self.conservative, self.closure = bool(conservative), closure
+        self.conservative, self.closure = flag(conservative, "conservative"), closure
         self.mass = check_mass(mass, closure, n, on)
         self.advection, self.gradient, self.velocity = None, None, None
         if velocity is not None:
@@ -141,6 +141,15 @@ class AdvectionDiffusionReaction(AbstractEvolution):
     def contractive(self):
         compressed = self.moving and self.conservative
         return self.reaction is None and self.closure is None and not compressed
+
+    @property
+    def _grows(self):
+        known = self.advection is not None and self.conservative
+        if not known or self.reaction is not None or self.closure is not None:
+            return super()._grows
+        assert self.advection is not None and self.gradient is not None
+        one = jnp.ones(self.n, self.gradient.weights.dtype)
+        return jnp.max(jnp.abs(self.advection(one)))  # that of the divergence
 
     @property
     def n(self):

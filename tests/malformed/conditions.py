@@ -394,4 +394,6 @@ CASES = [
              ("does not determine", "image")),
         ]
     ),
+    Case("robin", "no factor of the value", lambda: js.robin([1], a=None, b=1.0), ("a is None",)),
+    Case("robin", "no factor of the slope", lambda: js.robin([1], a=1.0, b=None), ("b is None",)),
 ]

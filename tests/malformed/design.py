@@ -150,6 +150,23 @@ CALLS = [
     ("rigid_motion", "an angle in space", lambda: js.rigid_motion(X, (0.3, X)), ("rotation", "()", "(3,)")),
     ("rigid_motion", "a shift in the plane", lambda: js.rigid_motion(X, (X, X[:2])), ("shift", "(2,)", "(3,)")),
     ("rigid_motion", "many points", lambda: js.rigid_motion(jnp.ones((5, 3)), (X, X)), ("x has shape (5, 3)", "(3,)")),
+    ("optimize_shape", "a number for further arguments", optimized(args=2.0), ("args is 2.0", "tuple")),
+    ("optimize_shape", "further arguments by name", optimized(args={"a": 2.0}), ("args is", "dict", "tuple")),
+    ("optimize_shape", "an objective in NumPy", optimized(f=lambda s: float(reach(s))), ("objective", "jax.numpy")),
+    ("optimize_shape", "a constraint in NumPy", optimized(equalities={"a": lambda s: np.sum(np.asarray(s.cloud.points))}), ("constraint 'a'", "jax.numpy")),
+    ("optimize_shape", "a constraint whose name is a number", optimized(equalities={3: reach}), ("equalities", "3", "text")),
+    ("optimize_shape", "text for renew", optimized(renew="no"), ("renew is 'no'", "True or False")),
+    ("optimize_shape", "a projection to more parameters", optimized(project=lambda t: jnp.stack([t, t])), ("project returns", "(2,)", "()")),
+    ("optimize_shape", "a projection to nothing", optimized(project=lambda t: None), ("project returns None", "()")),
+    ("optimize_shape", "a projection with L-BFGS", optimized(project=lambda t: t, optimizer=optax.lbfgs()), ("project", "L-BFGS", "first order")),
+    ("NormalShape", "a start that is not finite", lambda: js.NormalShape(surface(), jnp.full(80, jnp.nan)), ("start", "point 0", "nan")),
+    ("MappedShape", "parameters of one of two", lambda: js.MappedShape(lambda x, a: a * x, js.NormalShape(surface()))(jnp.zeros(80)), ("theta", "(80,)", "pair")),
+    ("MappedShape", "parameters of three", lambda: js.MappedShape(lambda x, a: a * x, js.NormalShape(surface()))((1.0, 2.0, 3.0)), ("theta has 3 parts", "2")),
+    ("rigid_motion", "a number for both", lambda: js.rigid_motion(X, 1.0), ("theta is 1.0", "rotation", "shift")),
+    ("rigid_motion", "a rotation alone", lambda: js.rigid_motion(X, (X,)), ("theta has 1 parts", "2")),
+    ("spherical_harmonics", "a direction of length zero", lambda: js.spherical_harmonics(jnp.zeros((2, 3)), 2), ("direction 0", "length 1")),
+    ("spherical_harmonics", "directions twice as long", lambda: js.spherical_harmonics(jnp.array([[1.0, 0, 0], [0, 2.0, 0]]), 2), ("direction 1", "length 1")),
+    ("compliance", "a load that is not finite", lambda: js.compliance(surface(), jnp.full(80, jnp.nan)), ("load", "point 0", "nan")),
 ]  # fmt: skip
 
 CASES = [Case(*case) for case in CALLS]

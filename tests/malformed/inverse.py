@@ -77,6 +77,20 @@ CALLS = [
     ("AbstractPrior", "made itself", lambda: js.AbstractPrior(), ("AbstractPrior", "abstract")),
     ("AbstractPrior", "a method that lacks", lambda: Half(), ("Half", "variance")),
     ("AbstractPrior", "a class for a prior", inverted(prior=js.GaussianPrior), ("prior", "Prior")),
+    ("solve_inverse", "no noise", inverted(noise=None), ("noise is None", "numbers")),
+    ("solve_inverse", "no data", inverted(data=None), ("data is None", "numbers")),
+    ("solve_inverse", "a model that returns nothing", inverted(lambda a: None), ("forward returns None", "arrays")),
+    ("solve_inverse", "a complex model", inverted(lambda a: 1j * line(a)), ("forward returns complex128", "floating-point")),
+    ("solve_inverse", "a model in NumPy", inverted(lambda a: np.asarray(a) * np.ones(3)), ("forward", "jax.numpy")),
+    ("solve_inverse", "a number for further arguments", inverted(lambda a, k: k * line(a), args=2.0), ("args is 2.0", "tuple")),
+    ("GaussianPrior", "a mean of other unknowns", lambda: js.GaussianPrior(THREE, jnp.ones(2)), ("mean has shape (2,)", "(3,)")),
+    ("GaussianPrior", "noise of other unknowns", lambda: js.GaussianPrior(THREE).color(jnp.ones(2)), ("xi has shape (2,)", "(3,)")),
+    ("GaussianPrior", "complex unknowns", lambda: js.GaussianPrior(1.0).whiten(1j), ("theta", "complex")),
+    ("MaternPrior", "noise of other points", lambda: field().color(THREE), ("xi has shape (3,)", "(80, ...)")),
+    ("Posterior", "half a sample", lambda: inverted()().posterior().samples(jax.random.key(0), 2.5), ("count is 2.5", "whole number")),
+    ("Posterior", "no samples", lambda: inverted()().posterior().samples(jax.random.key(0), 0), ("count = 0", "at least 1")),
+    ("Posterior", "a quantity of two arrays", lambda: inverted()().posterior().deviation_of(lambda a: (a, a)), ("quantity returns tuple", "array")),
+    ("Posterior", "a whole quantity", lambda: inverted()().posterior().deviation_of(lambda a: jnp.arange(3)), ("quantity returns int64", "floating-point")),
 ]  # fmt: skip
 
 CASES = [Case(*call) for call in CALLS]

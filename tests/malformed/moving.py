@@ -5,6 +5,7 @@
 
 import functools
 
+import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,6 +92,14 @@ CALLS = [
     ("WillmoreFlow", "times infinity", lambda: np.inf * js.WillmoreFlow(), ("factor", "inf")),
     ("WillmoreFlow", "a sum backwards", lambda: -0.5 * (js.WillmoreFlow() + js.Motion(lambda t, s, f, a: s.cloud.points)), ("factor", "-0.5")),
     ("evolve", "a motion plus a number", lambda: evolve(js.WillmoreFlow() + 0.1), ("WillmoreFlow", "float")),
+    ("evolve", "a save alone", lambda: evolve(saveat=0.5), ("saveat is a float", "sequence of times")),
+    ("evolve", "saves of diffrax", lambda: evolve(saveat=dfx.SaveAt(ts=[0.5])), ("saveat is a SaveAt", "sequence of times")),
+    ("evolve", "a problem without fields", lambda: evolve(problem=heat), ("problem", "0 arrays", "at least 1")),
+    ("evolve", "a problem of others", lambda: evolve(fields=jnp.ones(N), problem=lambda s: heat(js.discretize(js.sphere(70), method=js.GFDM(degree=2)))), ("problem", "70", "60")),
+    ("evolve", "a wave of one field", lambda: evolve(fields=jnp.ones(N), problem=lambda s: js.WaveEquation(s.laplacian)), ("fields", "2 arrays")),
+    ("evolve", "a velocity in NumPy", lambda: evolve(js.Motion(lambda t, s, f, a: np.sin(np.asarray(s.cloud.points)))), ("velocity", "jax.numpy")),
+    ("Adaptation", "one for true", lambda: js.Adaptation(0.1, conserve=1), ("conserve is 1", "True or False")),
+    ("MeanCurvatureFlow", "text for true", lambda: js.MeanCurvatureFlow("no"), ("keep_volume is 'no'", "True or False")),
 ]  # fmt: skip
 
 CASES = [Case(*case) for case in CALLS]

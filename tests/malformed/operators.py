@@ -66,6 +66,12 @@ def file_bytes() -> bytes:
         return path.read_bytes()
 
 
+def twice(weights) -> js.Stencil:
+    """A stencil by hand whose own points stand in two slots, in NumPy."""
+    indices = np.asarray(ring().indices)
+    return js.Stencil(np.concatenate([indices, indices[:1]]), weights)
+
+
 def load(data: bytes):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.npz"
@@ -341,6 +347,13 @@ CASES = [
     *[Case("Neighbors", *case) for case in NEIGHBORS],
     *[Case("find_neighbors", *case) for case in FIND],
     *[Case("Stencil", *case) for case in STENCIL],
+    Case("Stencil", "saved under a number", lambda: ring().save(3), ("path is 3", "str")),
+    Case(
+        "Stencil",
+        "its own points twice, in NumPy",
+        lambda: (twice(np.array([[-2.0] * N, [1.0] * N, [1.0] * N, [0.5] * N])) + 1)(np.ones(N)),
+        right=lambda found: np.allclose(found, 1.5),
+    ),
     *[Case(name, label, call, right=right) for name, label, call, right in FINE],
     *[case for name, make in BUILDERS.items() for case in of_each(name, make)],
     *[Case(*case) for case in COEFFICIENTS + SEARCH],

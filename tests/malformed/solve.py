@@ -224,4 +224,8 @@ CASES = [
     ],
     Case("multigrid", "a zero row", lambda: js.multigrid(js.Stencil(
         laplacian().indices, laplacian().weights.at[:, 5].set(0.0))), ("row 5",)),
+    Case("eigenmodes", "an operator of the other sign", lambda: js.eigenmodes(-laplacian(), 3),
+         ("eigenvalues", "below 0", "-operator")),
+    Case("solve_nonlinear", "a reaction in NumPy, as an array", lambda: newton(
+        reaction=lambda u, a: np.sin(np.asarray(u))), ("reaction", "jax.numpy")),
 ]  # fmt: skip

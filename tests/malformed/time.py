@@ -354,4 +354,28 @@ REST = [
     )
 ]  # fmt: skip
 
-CASES = INTEGRATE + PROBLEMS + SPECIAL + SOLVERS + REST
+TOLERANCES = [
+    Case("integrate", label, call, words)
+    for label, call, words in (
+        ("a controller that no step meets", lambda: js.integrate(
+            heat(), np.ones(N), t1=0.1, controller=dfx.PIDController(0.0, 0.0)),
+         ("controller.rtol = 0", "above 0")),
+        ("a controller below zero", lambda: js.integrate(
+            heat(), np.ones(N), t1=0.1, controller=dfx.PIDController(1e-3, -1.0)),
+         ("controller.atol = -1", "at least 0")),
+        ("a controller that is no number", lambda: js.integrate(
+            heat(), np.ones(N), t1=0.1, controller=dfx.PIDController(nan, 1e-3)),
+         ("controller.rtol = nan", "at least 0")),
+        ("a controller below round-off", lambda: js.integrate(
+            heat(), np.ones(N), t1=0.1, controller=dfx.PIDController(1e-18, 0.0)),
+         ("controller.rtol = 1e-18", "at least")),
+    )
+] + [
+    Case("Checkpoint", "in a folder that is not there", lambda: js.Checkpoint(
+        "not/there/run.npz", every=1.0), ("path", "no folder", "not/there")),
+    Case("AdvectionDiffusionReaction", "text for conservative", lambda:
+        js.AdvectionDiffusionReaction(heat().laplacian, conservative="no"),
+        ("conservative is 'no'", "True or False")),
+]  # fmt: skip
+
+CASES = TOLERANCES + INTEGRATE + PROBLEMS + SPECIAL + SOLVERS + REST

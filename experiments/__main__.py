@@ -146,6 +146,10 @@ EXPERIMENTS = {
         "sphere_flow",
         "Mean curvature flow of the sphere until r = 0.3, against sqrt(1 - 2t)",
     ),
+    "scans": (
+        "scans",
+        "Scans as they come: parts, holes, wide edges, bare points: the demo on all, heat kept",
+    ),
     "slopes": ("slopes", "Study: observed orders of the Laplacian on sphere, ellipsoid and torus"),
     "stability": (
         "stability",

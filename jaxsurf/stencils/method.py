@@ -154,14 +154,26 @@ def _calmed(method: AbstractMethod, around: Neighborhood, weights, support):
     others = jnp.sum(jnp.abs(weights[1:]), axis=0)
     share = jnp.where(others > 0, -weights[0] / jnp.where(others > 0, others, 1), -jnp.inf)
     # Without a jump where neighbours enter the support.
-    seen = _bend(around) * taper(around.squared / support**2)
-    tube = jnp.max(jnp.where(around.mask, seen, 0), axis=0) * support
-    part = _ramp((method.least_dominance - share) / _SHORT) * _ramp((tube - 1) / _BEYOND)
+    counted = jnp.where(around.mask, taper(around.squared / support**2), 0)
+    tube = power_mean(_bend(around) * support, counted)
+    part = ramp((method.least_dominance - share) / _SHORT) * ramp((tube - 1) / _BEYOND)
     blend = weights + part * (_positive(around, support) - weights)
     return jnp.where(part > 0, blend, weights), share
 
 
-def _ramp(x):
+def power_mean(values: Float[Array, "k *p"], counted: Float[Array, "k *p"]) -> Float[Array, "*p"]:
+    """Nearly the largest, and no more than it; smooth also where several are the largest."""
+    on = values > 0
+    total = jnp.sum(jnp.where(on, counted * jnp.where(on, values, 1) ** _POWER, 0), axis=0)
+    found = total > 0
+    mean = jnp.where(found, total, 1) / jnp.where(found, jnp.sum(counted, axis=0), 1)
+    return jnp.where(found, mean ** (1 / _POWER), 0)
+
+
+_POWER = 8
+
+
+def ramp(x):
     """From 0 at 0 to 1 at 1, with two continuous derivatives."""
     x = jnp.clip(x, 0, 1)
     return x**3 * (10 - 15 * x + 6 * x**2)

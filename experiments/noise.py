@@ -1,0 +1,148 @@
+r"""Noise of 1 to 10 % of the spacing: errors of normals, curvature, Laplacians and solutions.
+
+On a torus, where all is known, and on the bunny, where the reference is what the same points give
+without noise. Points are moved in all directions; normals are estimated from the moved points, by
+fits of the degree of the method to as many points as it has neighbours. The field is
+$e^{(x + 2y + 1.5z)/s}$ in space; its values stay those at the points without noise. The solution is
+that of $u - \ell^2 \Delta_S u = f$, with $\ell$ a tenth of the size: an implicit step of heat.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from jaxtyping import Array, Float
+from tqdm import tqdm
+
+import jaxsurf as js
+
+from . import data, surfaces
+from .report import Row, method_name, relative_l2
+
+_SHARES = (0.0, 0.01, 0.02, 0.05, 0.1)
+_QUANTITIES = ("normals, rad", "mean curvature", "Laplacian of a field", "solution")
+
+
+class Reader(NamedTuple):
+    """A method, and of how many neighbours in units of the usual number."""
+
+    method: js.GFDM
+    wider: int
+
+    @property
+    def name(self) -> str:
+        return method_name(self.method) + (f", {self.wider} k" if self.wider > 1 else "")
+
+
+class Truth(NamedTuple):
+    """A surface without noise, what is known on it, and the spacing of its points."""
+
+    name: str
+    cloud: js.PointCloud
+    mean: Float[Array, " n"]
+    field: Float[Array, " n"]
+    laplacian: Float[Array, " n"]
+    spacing: float
+
+    @property
+    def scale(self) -> float:
+        """Squared length that the solution is smoothed over."""
+        return float(jnp.ptp(self.cloud.points, axis=0).max() / 10) ** 2
+
+
+def torus(n: int) -> Truth:
+    of = surfaces.torus()
+    cloud = of.cloud("Poisson disk", n)
+    mean = js.level_set_curvature(of.phi, cloud.points)[0]
+    return Truth("torus", cloud, mean, *of.exact(cloud), of.spacing(n))
+
+
+def bunny(n: int) -> Truth:
+    """Without what the scan's own texture, finer than the points, makes of the reference."""
+    cloud = data.bunny(n)
+    surface = js.discretize(cloud)
+    x = cloud.points / jnp.ptp(cloud.points, axis=0).max()
+    field = jnp.exp(x @ jnp.array([1.0, 2.0, 1.5]))
+    spacing = float((surface.cell_areas.sum() / n) ** 0.5)
+    return Truth("bunny", cloud, surface.mean_curvature, field, surface.laplacian(field), spacing)
+
+
+def measured(truth: Truth, reader: Reader, share: float) -> dict[str, float]:
+    """Relative l2 errors, of the normals the root mean square of the angle."""
+    method, k = reader.method, reader.wider * reader.method.neighbor_count(3)
+    shift = np.random.default_rng(0).normal(size=truth.cloud.points.shape)
+    points = truth.cloud.points + share * truth.spacing * jnp.asarray(shift)
+    normals = js.estimate_normals(points, degree=method.degree, k=k)
+    cosine = jnp.sum(normals * truth.cloud.normals, axis=1)
+    normals = normals * jnp.sign(cosine)[:, None]
+    cloud = js.PointCloud(points, normals, boundary=truth.cloud.boundary)
+    neighbors = js.find_neighbors(cloud, k, throw=False)
+    if reader.wider == 1:
+        neighbors = js.choose_neighbors(cloud, method=method, throw=False)
+    surface = js.discretize(cloud, neighbors, method=method)
+    inner = slice(None) if cloud.boundary is None else ~np.asarray(cloud.boundary)
+    closure = None
+    if cloud.boundary is not None:
+        closure = js.eliminate(cloud, js.dirichlet(cloud.boundary, truth.field[cloud.boundary]))
+    operator = 1 - truth.scale * surface.laplacian
+    rhs = truth.field - truth.scale * truth.laplacian
+    solution = js.solve(operator, rhs, closure=closure).value
+    angle = jnp.arccos(jnp.clip(jnp.abs(cosine), 0, 1))
+    return {
+        "normals, rad": float(jnp.sqrt(jnp.mean(angle**2))),
+        "mean curvature": relative_l2(surface.mean_curvature[inner], truth.mean[inner]),
+        "Laplacian of a field": relative_l2(
+            surface.laplacian(truth.field)[inner], truth.laplacian[inner]
+        ),
+        "solution": relative_l2(solution, truth.field),
+    }
+
+
+_READERS = [Reader(js.GFDM(degree=p), wider) for p in (2, 4) for wider in (1, 2, 4)]
+_QUICK = [Reader(js.GFDM(degree=4), 1), Reader(js.GFDM(degree=2), 4)]
+# What is advised, and what it may be wrong by with noise of 10 %, by size of the surface.
+_ADVISED = _QUICK[1]
+
+
+def run(quick: bool, out: Path) -> list[Row]:
+    truths = [torus(1_500)] if quick else [torus(4_000)]
+    if not quick:
+        try:
+            truths.append(bunny(10_000))
+        except FileNotFoundError as error:
+            print(f"without the bunny: {error}")
+    rows: list[Row] = []
+    seen: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for truth in truths:
+        for reader in tqdm(_QUICK if quick else _READERS, desc=f"noise, {truth.name}"):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # it bends within one stencil
+                found = [measured(truth, reader, share) for share in _SHARES]
+            curves = {name: [one[name] for one in found] for name in found[0]}
+            seen[truth.name, reader.name] = curves
+            setting = {"surface": truth.name, "n": truth.cloud.n, "method": reader.name}
+            for name, values in curves.items():
+                for share, value in zip(_SHARES, values):
+                    rows.append(Row(name, value, setting | {"noise": share}))
+    _picture(out / "noise.png", seen)
+    return rows
+
+
+def _picture(path: Path, seen: dict) -> None:
+    surfaces_, names = (list(dict.fromkeys(column)) for column in zip(*seen))
+    figure, axes = plt.subplots(len(surfaces_), 4, figsize=(14, 3.4 * len(surfaces_)),
+                                layout="constrained", squeeze=False)  # fmt: skip
+    for line, surface in zip(axes, surfaces_):
+        for ax, quantity in zip(line, _QUANTITIES):
+            for name in names:
+                ax.plot(_SHARES, seen[surface, name][quantity], ".-", label=name)
+            ax.set(yscale="log", title=f"{surface}: {quantity}", xlabel="noise over spacing")
+            ax.set_xscale("symlog", linthresh=0.01)
+    axes[0, 0].legend(fontsize=7)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)

@@ -163,14 +163,15 @@ def _calmed(method: AbstractMethod, around: Neighborhood, weights, support):
 
 def power_mean(values: Float[Array, "k *p"], counted: Float[Array, "k *p"]) -> Float[Array, "*p"]:
     """Nearly the largest, and no more than it; smooth also where several are the largest."""
-    on = values > 0
-    total = jnp.sum(jnp.where(on, counted * jnp.where(on, values, 1) ** _POWER, 0), axis=0)
+    largest = jax.lax.stop_gradient(jnp.max(values, axis=0))
+    unit = jnp.where(largest > 0, largest, 1)
+    total = jnp.sum(counted * (values / unit) ** _POWER, axis=0)
     found = total > 0
     mean = jnp.where(found, total, 1) / jnp.where(found, jnp.sum(counted, axis=0), 1)
-    return jnp.where(found, mean ** (1 / _POWER), 0)
+    return jnp.where(found, unit * mean ** (1 / _POWER), 0)
 
 
-_POWER = 8
+_POWER = 32
 
 
 def ramp(x):

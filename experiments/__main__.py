@@ -121,6 +121,10 @@ EXPERIMENTS = {
         "geodesics",
         "Distances by the heat method: the sphere against great circles, bands on the bunny",
     ),
+    "noise": (
+        "noise",
+        "Study: noise of 1 to 10 % of the spacing: normals, curvature, Laplacians, solutions",
+    ),
     "poisson": (
         "poisson",
         "Study: Poisson on ellipsoid, torus and a surface of genus 2; scans; orders and steps",

@@ -162,6 +162,8 @@ def without_flux(surface: Discretization) -> Closure | None:
 # Weights of one sign begin to take over where the curvature times the reach of a stencil is this,
 # and have where it is more by so much.
 _BENT, _BEYOND = 1.0, 0.25
+# Or where what other values are multiplied by is in sum so many times what that at the border is.
+_GAIN, _MOST_GAIN = 6.0, 10.0
 # Length of their kernel in units of the reach.
 _NEAR = 0.3
 
@@ -169,8 +171,9 @@ _NEAR = 0.3
 def _outward_derivative(cloud, near: Rows, rows, conormals, method: AbstractMethod):
     r"""Weights of $\nu\cdot\nabla_S$ at some points, `(k, m)`, and their moment residuals.
 
-    Where the surface bends within the stencil, $\sum_j \eta_j (u_i - u_j)$ with positive $\eta$
-    over points further in, exact on linear functions of $\nu\cdot x$ only. What polynomials
+    Where the surface bends within the stencil, or too little stands behind the value at the border,
+    $\sum_j \eta_j (u_i - u_j)$ with positive $\eta$ over points further in, exact on linear
+    functions of $\nu\cdot x$ only. What polynomials
     extrapolate to a rough border can be a hundred times the values it comes from, and grows.
     """
     gradient, diagnostics = stencil_weights(cloud, near, method, Gradient(), rows)
@@ -184,7 +187,11 @@ def _outward_derivative(cloud, near: Rows, rows, conormals, method: AbstractMeth
     mean = jnp.sum(jnp.where(on, squared, 0), axis=0) / jnp.sum(used, axis=0)
     reach = jnp.sqrt(jnp.where(mean > 0, 2 * mean, 1))
     bend = jnp.where(on, jnp.abs(turn) / jnp.where(on, squared, 1), 0) * reach
-    part = ramp((power_mean(bend, on.astype(bend.dtype)) - _BENT) / _BEYOND)
+    bent = ramp((power_mean(bend, on.astype(bend.dtype)) - _BENT) / _BEYOND)
+    others, own = jnp.sum(jnp.abs(weights[1:]), axis=0), jnp.abs(weights[0])
+    gain = others / jnp.where(own > 0, own, 1)
+    loud = jnp.where(own > 0, ramp((gain - _GAIN) / (_MOST_GAIN - _GAIN)), 1)
+    part = bent + loud - bent * loud
 
     inwards = jnp.maximum(-jnp.einsum("mkd,md->km", offsets, conormals), 0)
     kernel = gaussian(squared, _NEAR * reach, reach, on)

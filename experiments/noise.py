@@ -118,10 +118,10 @@ def _added(values: list[float]) -> float:
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    truths = [torus(2_000 if quick else 4_000)]
+    truths = [torus(2_000)]
     if not quick:
         try:
-            truths.append(bunny(10_000))
+            truths.append(bunny(2_960))
         except FileNotFoundError as error:
             print(f"without the bunny: {error}")
     rows: list[Row] = []

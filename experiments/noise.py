@@ -121,13 +121,15 @@ def run(quick: bool, out: Path) -> list[Row]:
     truths = [torus(2_000)]
     if not quick:
         try:
-            truths.append(bunny(2_960))
+            truths.append(bunny(10_000))
         except FileNotFoundError as error:
             print(f"without the bunny: {error}")
     rows: list[Row] = []
     seen: dict[tuple[str, str], dict[str, list[float]]] = {}
     for truth in truths:
-        for reader in tqdm(_QUICK if quick else _READERS, desc=f"noise, {truth.name}"):
+        # Wide lists of a degree that noise needs to be low for: once is enough.
+        readers = _QUICK if quick else _READERS if truth.name == "torus" else _READERS[:-1]
+        for reader in tqdm(readers, desc=f"noise, {truth.name}"):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # it bends within one stencil
                 found = [measured(truth, reader, share) for share in _SHARES]
@@ -156,7 +158,8 @@ def _picture(path: Path, seen: dict) -> None:
     for line, surface in zip(axes, surfaces_):
         for ax, quantity in zip(line, _QUANTITIES):
             for name in names:
-                ax.plot(_SHARES, seen[surface, name][quantity], ".-", label=name)
+                if (surface, name) in seen:
+                    ax.plot(_SHARES, seen[surface, name][quantity], ".-", label=name)
             ax.set(yscale="log", title=f"{surface}: {quantity}", xlabel="noise over spacing")
             ax.set_xscale("symlog", linthresh=0.01)
     axes[0, 0].legend(fontsize=7)

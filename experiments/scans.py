@@ -51,15 +51,17 @@ def _cases(quick: bool, folder: Path) -> Iterator[Case]:
         return lambda: js.read(rough.write(folder / "scan.obj", mesh), **{"n": n, **how})
 
     drops = [rough.moved(rough.star(2 * n), (x, 0.0, 0.0), 0.6) for x in (-0.7, 0.7)]
-    yield Case("parts", "star in a ring", read(rough.together(star, ring)))
-    yield Case("holes", "star with four", read(rough.holed(star, [0.5, 0.3, 0.2, 0.1])))
+    # Farther apart than stencils reach: where normals agree, other parts count as neighbours.
+    around = rough.ring(4 * n, R=3.0)
+    yield Case("parts", "star in a ring", read(rough.together(star, around)))
+    yield Case("holes", "star with four holes", read(rough.holed(star, [0.5, 0.3, 0.2, 0.1])))
     yield Case("wide edges", "star with a fin", read(rough.finned(star), largest_part=True))
     yield Case("bare points", "star, 2 % noise", lambda: _bare(rough.star(n)[0], 0.02))
     if quick:
         return
     shell = rough.moved(star, (0.0, 0.0, 0.0), 2.5)
     yield Case("parts", "two drops in a shell", read(rough.together(*drops, shell)))
-    yield Case("holes", "ring with twenty", read(rough.holed(ring, 20 * [0.25])))
+    yield Case("holes", "ring with twenty holes", read(rough.holed(ring, 20 * [0.25])))
     yield Case(
         "wide edges", "ring with a wall", read(rough.ring(4 * n, wall=True), largest_part=True)
     )
@@ -140,25 +142,27 @@ def run(quick: bool, out: Path) -> list[Row]:
                 print(f"without {case.name}: {error}")
                 continue
             rows += found
-            pictures.append((case.name, *picture))
+            pictures.append((case, *picture))
     _picture(out / "scans.png", pictures)
     return rows
 
 
 def _picture(path: Path, pictures: list) -> None:
-    """Heat at the end, with borders and gaps as they are."""
+    """Heat at the end, seen from where it is."""
     columns = min(5, len(pictures))
     lines = -(-len(pictures) // columns)
     size = (3.4 * columns, 3.2 * lines)
     figure, axes = plt.subplots(lines, columns, figsize=size, layout="constrained", squeeze=False)
     for ax in axes.ravel():
         ax.set_axis_off()
-    for ax, (name, cloud, heat) in zip(axes.ravel(), pictures):
-        up, view = (
-            ((0.0, 1.0, 0.0), (0.5, 0.5, 1.7))
-            if "," in name
-            else ((0.0, 0.0, 1.0), (0.7, -1.7, 1.3))
+    for ax, (case, cloud, heat) in zip(axes.ravel(), pictures):
+        # Scans are stored with y up.
+        up = np.array([0.0, 1.0, 0.0] if case.kind == "scan" else [0.0, 0.0, 1.0])
+        view = np.asarray(cloud.normals)[np.argmax(heat)]
+        view = view - (view @ up) * up
+        view = view / np.linalg.norm(view) + 0.6 * up
+        js.plot_cloud(
+            cloud, heat, ax=ax, title=case.name, up=tuple(up), view=tuple(view), pixels=400
         )
-        js.plot_cloud(cloud, heat, ax=ax, title=name, up=up, view=view, pixels=400)
     figure.savefig(path, dpi=120)
     plt.close(figure)

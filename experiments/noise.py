@@ -1,10 +1,10 @@
 r"""Noise of 1 to 10 % of the spacing: errors of normals, curvature, Laplacians and solutions.
 
-On a torus, where all is known, and on the bunny, where the reference is what the same points give
-without noise. Points are moved in all directions; normals are estimated from the moved points, by
-fits of the degree of the method to as many points as it has neighbours. The field is
-$e^{(x + 2y + 1.5z)/s}$ in space; its values stay those at the points without noise. The solution is
-that of $u - \ell^2 \Delta_S u = f$, with $\ell$ a tenth of the size: an implicit step of heat.
+On a torus, where all is known, and on the bunny, where the reference is what the same method makes
+of the same points without noise. Points are moved in all directions; normals are estimated from
+the moved points, by fits of the degree of the method to as many points as it has neighbours. The
+field is $e^{(x + 2y + 1.5z)/s}$ in space; its values stay those at the points without noise. The
+solution is that of $u - \ell^2 \Delta_S u = f$, $\ell$ a tenth of the size: an implicit step of heat.
 """
 
 from __future__ import annotations
@@ -39,68 +39,72 @@ class Reader(NamedTuple):
         return method_name(self.method) + (f", {self.wider} k" if self.wider > 1 else "")
 
 
-class Truth(NamedTuple):
-    """A surface without noise, what is known on it, and the spacing of its points."""
+class Case(NamedTuple):
+    """Points without noise, their spacing, a field, a right-hand side; and what is known."""
 
     name: str
     cloud: js.PointCloud
-    mean: Float[Array, " n"]
-    field: Float[Array, " n"]
-    laplacian: Float[Array, " n"]
     spacing: float
+    field: Float[Array, " n"]
+    rhs: Float[Array, " n"]
+    exact: dict[str, Array] | None
 
     @property
     def scale(self) -> float:
         """Squared length that the solution is smoothed over."""
-        return float(jnp.ptp(self.cloud.points, axis=0).max() / 10) ** 2
+        return _scale(self.cloud)
 
 
-def torus(n: int) -> Truth:
+def _scale(cloud: js.PointCloud) -> float:
+    return float(jnp.ptp(cloud.points, axis=0).max() / 10) ** 2
+
+
+def torus(n: int) -> Case:
     of = surfaces.torus()
     cloud = of.cloud("Poisson disk", n)
     mean = js.level_set_curvature(of.phi, cloud.points)[0]
-    return Truth("torus", cloud, mean, *of.exact(cloud), of.spacing(n))
+    field, laplacian = of.exact(cloud)
+    exact = dict(zip(_QUANTITIES, (cloud.normals, mean, laplacian, field)))
+    return Case("torus", cloud, of.spacing(n), field, field - _scale(cloud) * laplacian, exact)
 
 
-def bunny(n: int) -> Truth:
-    """Without what the scan's own texture, finer than the points, makes of the reference."""
+def bunny(n: int) -> Case:
+    """Its texture is finer than the points: what each method makes of these is the reference."""
     cloud = data.bunny(n)
-    surface = js.discretize(cloud)
-    x = cloud.points / jnp.ptp(cloud.points, axis=0).max()
-    field = jnp.exp(x @ jnp.array([1.0, 2.0, 1.5]))
-    spacing = float((surface.cell_areas.sum() / n) ** 0.5)
-    return Truth("bunny", cloud, surface.mean_curvature, field, surface.laplacian(field), spacing)
+    field = jnp.exp(cloud.points @ jnp.array([1.0, 2.0, 1.5]) / jnp.ptp(cloud.points))
+    spacing = float((js.discretize(cloud).cell_areas.sum() / n) ** 0.5)
+    return Case("bunny", cloud, spacing, field, field, None)
 
 
-def measured(truth: Truth, reader: Reader, share: float) -> dict[str, float]:
-    """Relative l2 errors, of the normals the root mean square of the angle."""
+def results(case: Case, reader: Reader, share: float) -> dict[str, Array]:
+    """Everything on points with this share of noise."""
     method, k = reader.method, reader.wider * reader.method.neighbor_count(3)
-    shift = np.random.default_rng(0).normal(size=truth.cloud.points.shape)
-    points = truth.cloud.points + share * truth.spacing * jnp.asarray(shift)
+    clean = case.cloud
+    shift = np.random.default_rng(0).normal(size=clean.points.shape)
+    points = clean.points + share * case.spacing * jnp.asarray(shift)
     normals = js.estimate_normals(points, degree=method.degree, k=k)
-    cosine = jnp.sum(normals * truth.cloud.normals, axis=1)
-    normals = normals * jnp.sign(cosine)[:, None]
-    cloud = js.PointCloud(points, normals, boundary=truth.cloud.boundary)
+    normals = normals * jnp.sign(jnp.sum(normals * clean.normals, axis=1, keepdims=True))
+    cloud = js.PointCloud(points, normals, boundary=clean.boundary)
     neighbors = js.find_neighbors(cloud, k, throw=False)
     if reader.wider == 1:
         neighbors = js.choose_neighbors(cloud, method=method, throw=False)
     surface = js.discretize(cloud, neighbors, method=method)
-    inner = slice(None) if cloud.boundary is None else ~np.asarray(cloud.boundary)
     closure = None
     if cloud.boundary is not None:
-        closure = js.eliminate(cloud, js.dirichlet(cloud.boundary, truth.field[cloud.boundary]))
-    operator = 1 - truth.scale * surface.laplacian
-    rhs = truth.field - truth.scale * truth.laplacian
-    solution = js.solve(operator, rhs, closure=closure).value
-    angle = jnp.arccos(jnp.clip(jnp.abs(cosine), 0, 1))
-    return {
-        "normals, rad": float(jnp.sqrt(jnp.mean(angle**2))),
-        "mean curvature": relative_l2(surface.mean_curvature[inner], truth.mean[inner]),
-        "Laplacian of a field": relative_l2(
-            surface.laplacian(truth.field)[inner], truth.laplacian[inner]
-        ),
-        "solution": relative_l2(solution, truth.field),
-    }
+        closure = js.eliminate(cloud, js.dirichlet(cloud.boundary, case.field[cloud.boundary]))
+    solution = js.solve(1 - case.scale * surface.laplacian, case.rhs, closure=closure).value
+    found = (normals, surface.mean_curvature, surface.laplacian(case.field), solution)
+    return dict(zip(_QUANTITIES, found))
+
+
+def errors(case: Case, found: dict[str, Array], exact: dict[str, Array]) -> dict[str, float]:
+    """Relative l2 errors inside, of the normals the root mean square of the angle."""
+    border = case.cloud.boundary
+    inner = slice(None) if border is None else ~np.asarray(border)
+    errors = {name: relative_l2(found[name][inner], exact[name][inner]) for name in _QUANTITIES}
+    cosine = jnp.sum(found["normals, rad"] * exact["normals, rad"], axis=1)
+    angle = jnp.arccos(jnp.clip(cosine, -1, 1))
+    return errors | {"normals, rad": float(jnp.sqrt(jnp.mean(angle**2)))}
 
 
 _READERS = [Reader(js.GFDM(degree=p), wider) for p in (2, 4) for wider in (1, 2, 4)]
@@ -118,25 +122,27 @@ def _added(values: list[float]) -> float:
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    truths = [torus(2_000)]
+    cases = [torus(2_000)]
     if not quick:
         try:
-            truths.append(bunny(10_000))
+            cases.append(bunny(10_000))
         except FileNotFoundError as error:
             print(f"without the bunny: {error}")
     rows: list[Row] = []
     seen: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for truth in truths:
+    for case in cases:
         # Wide lists of a degree that noise needs to be low for: once is enough.
-        readers = _QUICK if quick else _READERS if truth.name == "torus" else _READERS[:-1]
-        for reader in tqdm(readers, desc=f"noise, {truth.name}"):
+        readers = _QUICK if quick else _READERS if case.name == "torus" else _READERS[:-1]
+        for reader in tqdm(readers, desc=f"noise, {case.name}"):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # it bends within one stencil
-                found = [measured(truth, reader, share) for share in _SHARES]
+                found = [results(case, reader, share) for share in _SHARES]
+                exact = case.exact or found[0]
+                found = [errors(case, one, exact) for one in found]
             curves = {name: [one[name] for one in found] for name in found[0]}
-            seen[truth.name, reader.name] = curves
-            setting = {"surface": truth.name, "n": truth.cloud.n, "method": reader.name}
-            known = truth.name == "torus"
+            seen[case.name, reader.name] = curves
+            setting = {"surface": case.name, "n": case.cloud.n, "method": reader.name}
+            known = case.name == "torus"
             for name, values in curves.items():
                 for share, value in zip(_SHARES, values):
                     last = known and share == _SHARES[-1]

@@ -4,7 +4,7 @@ On a torus, where all is known, and on the bunny, where the reference is what th
 of the same points without noise. Points are moved in all directions; normals are estimated from
 the moved points, by fits of the degree of the method to as many points as it has neighbours. The
 field is $e^{(x + 2y + 1.5z)/s}$ in space; its values stay those at the points without noise. The
-solution is that of $u - \ell^2 \Delta_S u = f$, $\ell$ a tenth of the size: an implicit step of heat.
+solution is that of $u - \ell^2 \Delta_S u = f$, $\ell$ a tenth of the size: a step of heat.
 """
 
 from __future__ import annotations

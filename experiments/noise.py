@@ -97,14 +97,28 @@ def results(case: Case, reader: Reader, share: float) -> dict[str, Array]:
     return dict(zip(_QUANTITIES, found))
 
 
-def errors(case: Case, found: dict[str, Array], exact: dict[str, Array]) -> dict[str, float]:
-    """Relative l2 errors inside, of the normals the root mean square of the angle."""
+def _made(case: Case, reader: Reader, share: float) -> dict[str, Array] | None:
+    """The results, or None where the noise leaves a point too few neighbours on its side."""
+    try:
+        return results(case, reader, share)
+    except ValueError as error:
+        print(f"{case.name}, {reader.name}, noise {share}: {error}")
+        return None
+
+
+def errors(case: Case, found: dict[str, Array] | None, exact: dict[str, Array]) -> dict[str, float]:
+    """Relative l2 errors inside, of the normals the root mean square of the angle.
+
+    No numbers of results that there are none of.
+    """
+    if found is None:
+        return dict.fromkeys(_QUANTITIES, np.nan)
     border = case.cloud.boundary
     inner = slice(None) if border is None else ~np.asarray(border)
-    errors = {name: relative_l2(found[name][inner], exact[name][inner]) for name in _QUANTITIES}
+    off = {name: relative_l2(found[name][inner], exact[name][inner]) for name in _QUANTITIES}
     cosine = jnp.sum(found["normals, rad"] * exact["normals, rad"], axis=1)
     angle = jnp.arccos(jnp.clip(cosine, -1, 1))
-    return errors | {"normals, rad": float(jnp.sqrt(jnp.mean(angle**2)))}
+    return off | {"normals, rad": float(jnp.sqrt(jnp.mean(angle**2)))}
 
 
 _READERS = [Reader(js.GFDM(degree=p), wider) for p in (2, 4) for wider in (1, 2, 4)]
@@ -136,9 +150,10 @@ def run(quick: bool, out: Path) -> list[Row]:
         for reader in tqdm(readers, desc=f"noise, {case.name}"):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # it bends within one stencil
-                found = [results(case, reader, share) for share in _SHARES]
-                exact = case.exact or found[0]
-                found = [errors(case, one, exact) for one in found]
+                made = [_made(case, reader, share) for share in _SHARES]
+                exact = case.exact or made[0]
+                assert exact is not None
+                found = [errors(case, one, exact) for one in made]
             curves = {name: [one[name] for one in found] for name in found[0]}
             seen[case.name, reader.name] = curves
             setting = {"surface": case.name, "n": case.cloud.n, "method": reader.name}

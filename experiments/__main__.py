@@ -121,6 +121,10 @@ EXPERIMENTS = {
         "geodesics",
         "Distances by the heat method: the sphere against great circles, bands on the bunny",
     ),
+    "noise": (
+        "noise",
+        "Study: noise of 1 to 10 % of the spacing: normals, curvature, Laplacians, solutions",
+    ),
     "poisson": (
         "poisson",
         "Study: Poisson on ellipsoid, torus and a surface of genus 2; scans; orders and steps",
@@ -145,6 +149,10 @@ EXPERIMENTS = {
     "sphere-flow": (
         "sphere_flow",
         "Mean curvature flow of the sphere until r = 0.3, against sqrt(1 - 2t)",
+    ),
+    "scans": (
+        "scans",
+        "Scans as they come: parts, holes, wide edges, bare points: the demo on all, heat kept",
     ),
     "slopes": ("slopes", "Study: observed orders of the Laplacian on sphere, ellipsoid and torus"),
     "stability": (

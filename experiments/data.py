@@ -1,4 +1,4 @@
-"""The meshes of the Stanford repository that are handed out beside the project."""
+"""The meshes of well-known scans that are handed out beside the project."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from jaxsurf.io import read
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data"
 BUNNY = FOLDER / "stanford-bunny.obj"
 _ARMADILLO = FOLDER / "armadillo.obj"
+_SPOT = FOLDER / "spot.obj"
 
 
 def bunny(n: int | None = None) -> js.PointCloud:
@@ -28,6 +29,15 @@ def armadillo(n: int | None = None) -> js.PointCloud:
         FileNotFoundError: the mesh is absent.
     """
     return _scan(_ARMADILLO, n)
+
+
+def spot(n: int | None = None) -> js.PointCloud:
+    """The vertices of the cow Spot, or n quasi-uniform points on it.
+
+    Raises:
+        FileNotFoundError: the mesh is absent.
+    """
+    return _scan(_SPOT, n)
 
 
 def _scan(path: Path, n: int | None) -> js.PointCloud:

@@ -17,9 +17,10 @@ from .cloud import PointCloud
 from .conditions import Condition, checked_conditions
 from .discretization import Discretization
 from .failures import is_concrete, needs_values, raise_at
+from .fits.kernels import gaussian
 from .neighbors import Neighbors, Rows, nearest_of
 from .stencils.gfdm import GFDM
-from .stencils.method import AbstractMethod
+from .stencils.method import AbstractMethod, power_mean, ramp
 from .stencils.targets import Gradient
 
 
@@ -96,12 +97,11 @@ def eliminate(
             b = jnp.broadcast_to(condition.b, condition.m)[own].astype(dtype)
             nu = _conormals(cloud, condition, rows, own, border)
             near = _free_neighbors(cloud, rows, free, neighbors, method)
-            gradient, diagnostics = stencil_weights(cloud, near, method, Gradient(), rows)
-            w = jnp.einsum("md,kdm->km", nu, gradient)
+            w, residual = _outward_derivative(cloud, near, rows, nu, method)
             pivot, slots, weights = a + b * w[0], near.indices.T[1:], -b * w[1:]
             if throw and is_concrete(w, a, b):
                 size = np.abs(a) + np.abs(b) * np.abs(w).sum(axis=0)
-                _check_stencils(rows, near, diagnostics.residual, method, cloud.dim)
+                _check_stencils(rows, near, residual, method, cloud.dim)
                 check_pivots(pivot, size, rows, "value at point {i}: a + b w_i")
         parts.append((rows, slots, weights / pivot))
         place = jnp.arange(start, start + m)
@@ -150,14 +150,56 @@ def without_flux(surface: Discretization) -> Closure | None:
     slots, own = neighbors.indices[rows], rows[:, None]
     bound = jnp.zeros(cloud.n, bool).at[rows].set(True)
     near = Rows(slots, neighbors.mask[rows] & (~bound[slots] | (slots == own)), None)
-    gradient, diagnostics = stencil_weights(cloud, near, method, Gradient(), rows)
-    w = jnp.einsum("md,kdm->km", border.conormals(cloud), gradient)
+    w, residual = _outward_derivative(cloud, near, rows, border.conormals(cloud), method)
     if is_concrete(w):
         names = np.asarray(rows)
-        _check_stencils(names, near, diagnostics.residual, method, cloud.dim)
+        _check_stencils(names, near, residual, method, cloud.dim)
         size = np.abs(w).sum(axis=0)
         check_pivots(w[0], size, names, "value at point {i}: the weight w_i of its derivative")
     return Closure(cloud.n, rows, slots.T[1:], -w[1:] / w[0], (), bound)
+
+
+# Weights of one sign begin to take over where the curvature times the reach of a stencil is this,
+# and have where it is more by so much.
+_BENT, _BEYOND = 1.0, 0.25
+# Or where what other values are multiplied by is in sum so many times what that at the border is.
+_GAIN, _MOST_GAIN = 6.0, 10.0
+# Length of their kernel in units of the reach.
+_NEAR = 0.3
+
+
+def _outward_derivative(cloud, near: Rows, rows, conormals, method: AbstractMethod):
+    r"""Weights of $\nu\cdot\nabla_S$ at some points, `(k, m)`, and their moment residuals.
+
+    Where the surface bends within the stencil, or too little stands behind the value at the border,
+    $\sum_j \eta_j (u_i - u_j)$ with positive $\eta$ over points further in, exact on linear
+    functions of $\nu\cdot x$ only. What polynomials
+    extrapolate to a rough border can be a hundred times the values it comes from, and grows.
+    """
+    gradient, diagnostics = stencil_weights(cloud, near, method, Gradient(), rows)
+    weights = jnp.einsum("md,kdm->km", conormals, gradient)
+    seen, used = cloud.seen, near.mask.T
+    offsets = seen.points[near.indices] - seen.points[rows][:, None]
+    turn = jnp.sum(offsets * (seen.normals[near.indices] - seen.normals[rows][:, None]), axis=2).T
+    squared = jnp.sum(offsets**2, axis=2).T
+    on = used & (squared > 0)
+    # Of points that fill a disc, half of its squared radius is the mean.
+    mean = jnp.sum(jnp.where(on, squared, 0), axis=0) / jnp.sum(used, axis=0)
+    reach = jnp.sqrt(jnp.where(mean > 0, 2 * mean, 1))
+    bend = jnp.where(on, jnp.abs(turn) / jnp.where(on, squared, 1), 0) * reach
+    bent = ramp((power_mean(bend, on.astype(bend.dtype)) - _BENT) / _BEYOND)
+    others, own = jnp.sum(jnp.abs(weights[1:]), axis=0), jnp.abs(weights[0])
+    gain = others / jnp.where(own > 0, own, 1)
+    loud = jnp.where(own > 0, ramp((gain - _GAIN) / (_MOST_GAIN - _GAIN)), 1)
+    part = bent + loud - bent * loud
+
+    inwards = jnp.maximum(-jnp.einsum("mkd,md->km", offsets, conormals), 0)
+    kernel = gaussian(squared, _NEAR * reach, reach, on)
+    second = jnp.sum(kernel * inwards**2, axis=0)
+    one_sign = -kernel * inwards / jnp.where(second > 0, second, 1)
+    one_sign = one_sign.at[0].set(-jnp.sum(one_sign[1:], axis=0))
+    blend = weights + part * (one_sign - weights)
+    return jnp.where((part > 0) & (second > 0), blend, weights), diagnostics.residual
 
 
 def check_parts(cloud, neighbors, border) -> None:

@@ -103,6 +103,16 @@ def test_no_square_array_in_the_cycle(screened):
     assert f"{n},{n}" not in text
 
 
+def test_very_many_neighbours():
+    """No connection is strong by itself: none were found, and the coarsest matrix was singular."""
+    cloud = js.sphere(700)
+    lists = js.find_neighbors(cloud, k=200, throw=False)
+    operator = 1 - js.laplace_beltrami(cloud, lists, method=js.GFDM(degree=2))
+    solution = js.solve(operator, 3 * cloud.points[:, 2])
+    assert solution.stats["num_steps"] < 15
+    assert jnp.abs(solution.value - cloud.points[:, 2]).max() < 0.2
+
+
 def test_jacobi_is_the_diagonal():
     cloud = js.sphere(300)
     operator = js.laplace_beltrami(cloud) - 3

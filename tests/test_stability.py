@@ -10,7 +10,7 @@ import scipy.linalg
 import jaxsurf as js
 from experiments import data
 
-from .helpers import METHODS, jittered_sphere, label, random_sphere
+from .helpers import METHODS, check_derivatives, jittered_sphere, label, random_sphere
 
 CLOUDS = {
     "fibonacci": js.sphere(800),
@@ -79,10 +79,62 @@ def test_folds_that_no_neighbourhood_serves_get_positive_weights():
         warnings.simplefilter("ignore", UserWarning)  # it bends within one stencil
         operator = js.laplace_beltrami(cloud, method=method)
     told, weights = operator.diagnostics, np.asarray(operator.weights)
-    folds = np.asarray((told.dominance < method.least_dominance) & (told.tube > 1))
+    # Beyond the range in which they take over.
+    folds = np.asarray((told.dominance < method.least_dominance - 0.1) & (told.tube > 1.5))
     assert 0 < folds.sum() < 0.005 * cloud.n
     assert (weights[1:, folds] >= 0).all()
     squared = np.sum((cloud.points[operator.indices] - cloud.points) ** 2, axis=2)
     np.testing.assert_allclose((weights * squared).sum(axis=0)[folds], 4, rtol=1e-9)
     spectrum = js.spectral_estimate(operator)
     assert spectrum.abscissa < 1e-8 * spectrum.radius
+
+
+class AsTheyAre(js.GFDM):
+    """Keeps its weights, wherever the centre is not dominant."""
+
+    least_dominance = -np.inf
+
+
+def test_positive_weights_take_over_smoothly():
+    """Weights between two kinds have the derivative of differences; others are what they were."""
+    cloud = random_sphere(120)
+    lists = js.find_neighbors(cloud, k=40, throw=False)
+    built = lambda cloud, method: js.laplace_beltrami(cloud, lists, method=method, throw=False)
+    own, blended = (np.asarray(built(cloud, m(degree=4)).weights) for m in (AsTheyAre, js.GFDM))
+    between = (own != blended).any(axis=0)
+    assert 5 < between.sum() < 30
+    assert (own[1:, between] < 0).any(axis=0).all() and (blended[1:, between] < 0).any()
+    field = jnp.sin(3 * cloud.points[:, 0]) + cloud.points[:, 1] ** 2
+
+    def values(points, normals):
+        return built(js.PointCloud(points, normals), js.GFDM(degree=4))(field)[between][:4]
+
+    check_derivatives(values, cloud.points, cloud.normals, rtol=1e-5)
+
+
+def test_no_heat_grows_at_a_rough_border():
+    """One value that was extrapolated to the border of the bunny made it grow."""
+    cloud = scan(data.bunny, 2_960)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # it bends within one stencil
+        surface = js.discretize(cloud)
+        closure = js.without_flux(surface)
+        spectrum = js.spectral_estimate(closure.reduce(surface.laplacian))
+    assert spectrum.abscissa < 1e-8 * spectrum.radius
+
+
+def test_weights_of_one_sign_take_over_smoothly_at_a_border():
+    bowl = lambda s: (jnp.sin(s), -jnp.cos(s))
+    # Curvature times reach is 1.16 on its border: two thirds of the way from 1 to 1.25.
+    cap = js.surface_of_revolution(bowl, 100)
+    surface = js.discretize(cap, js.find_neighbors(cap, k=60))
+    closure = js.without_flux(surface)
+    assert (closure.weights < 0).any()
+
+    def values(points, normals):
+        moved = js.Discretization(
+            js.PointCloud(points, normals), surface.neighbors, surface.method, surface.border
+        )
+        return js.without_flux(moved)(cap.points[:, 2])[closure.rows[:4]]
+
+    check_derivatives(values, cap.points, cap.normals, rtol=1e-5)

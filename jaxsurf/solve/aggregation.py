@@ -14,6 +14,8 @@ from ..stencils.padded import PaddedMatrix
 _COARSENING = 8
 # A connection counts as strong from this share of the geometric mean of both diagonal entries.
 _STRENGTH = 0.05
+# Share of the points that may be left without strong connections.
+_ALONE = 0.2
 # The smoother damps the part of the spectrum from this share of its end upwards.
 _SMOOTHED = 0.25
 
@@ -41,8 +43,12 @@ def aggregate(matrix, constant):
             "js.multigrid needs pyamg: pip install 'jaxsurf[multigrid]'. Without it pass "
             "preconditioner=js.jacobi(operator), which takes more steps"
         ) from error
-    strong = symmetric_strength_of_connection(matrix, theta=_STRENGTH)
-    aggregates = standard_aggregation(strong)[0]
+    # Of very many neighbours none is strong beside the centre: then what is strong is weaker.
+    for theta in _STRENGTH / 2.0 ** np.arange(8):
+        strong = symmetric_strength_of_connection(matrix, theta=theta)
+        aggregates = standard_aggregation(strong)[0]
+        if np.mean(np.diff(aggregates.indptr) == 0) < _ALONE:
+            break
     if aggregates.shape[1] == 0 or aggregates.shape[1] > 0.8 * matrix.shape[0]:
         return None
     tentative, coarse = fit_candidates(aggregates, constant[:, None])

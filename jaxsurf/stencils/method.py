@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ..arguments import as_float, real, whole
-from ..fits.kernels import gaussian
+from ..fits.kernels import gaussian, taper
 from ..fits.monomials import polynomial_count
 from ..fits.plane import Neighborhood, dot
 from .targets import AbstractTarget, Joint, Laplacian
@@ -29,9 +29,9 @@ class Diagnostics(eqx.Module):
             tube of that radius around the surface intersects itself: copies along the normals
             cross, and the surface is no graph over the tangent plane.
         dominance: share of the centre among the absolute weights of the others, in the Laplacian
-            that the method makes; -inf where there are no others. Where it is less than
-            `least_dominance` and `tube` above 1, the Laplacian has positive weights instead. None
-            for other operators.
+            that the method makes; -inf where there are no others. Where it falls below
+            `least_dominance` and the surface bends within the stencil, the Laplacian goes over
+            to positive weights. None for other operators.
 
     Example:
         >>> found = js.laplace_beltrami(js.sphere(300)).diagnostics
@@ -52,19 +52,21 @@ class Diagnostics(eqx.Module):
         """Diagnostics of one stencil: what the solve tells, and what its geometry does."""
         r2 = around.squared
         inside = around.mask & (r2 < support**2)
-        turn = dot(around.offsets, around.normals - around.normals[0])
-        bend = jnp.where(inside & (r2 > 0), jnp.abs(turn) / jnp.where(r2 > 0, r2, 1), 0)
-        return jax.tree.map(
-            jax.lax.stop_gradient,
-            cls(
-                condition,
-                residual,
-                jnp.sum(inside, axis=0),
-                support,
-                jnp.full(support.shape, layers, jnp.int32),
-                jnp.max(bend, axis=0) * support,
-            ),
+        return cls(
+            condition,
+            residual,
+            jnp.sum(inside, axis=0),
+            support,
+            jnp.full(support.shape, layers, jnp.int32),
+            jnp.max(jnp.where(inside, _bend(around), 0), axis=0) * support,
         )
+
+
+def _bend(around: Neighborhood) -> Float[Array, "k *p"]:
+    """Normal curvature on the way to each neighbour, as the normals tell it."""
+    r2 = around.squared
+    turn = dot(around.offsets, around.normals - around.normals[0])
+    return jnp.where(r2 > 0, jnp.abs(turn) / jnp.where(r2 > 0, r2, 1), 0)
 
 
 class AbstractMethod(eqx.Module):
@@ -126,28 +128,56 @@ def weights_by(
     values = as_float(found[0], name)
     if values.shape[values.ndim - len(want) :] != want:
         raise ValueError(f"{name} has shape {values.shape}, expected (*components, {str(want)[1:]}")
-    if isinstance(target, Laplacian):
-        return _calmed(method, around, values, found[1])
-    if isinstance(target, Joint) and isinstance(target.targets[0], Laplacian):
-        laplacian, diagnostics = _calmed(method, around, values[0], found[1])
-        return values.at[0].set(laplacian), diagnostics
-    return values, found[1]
-
-
-def _calmed(method: AbstractMethod, around: Neighborhood, weights, diagnostics: Diagnostics):
-    """The Laplacian's weights, positive where the surface bends and the centre is not dominant.
-
-    There no polynomial is of use, and a few such rows give an operator growing modes. Weights of
-    one sign are inaccurate, but let nothing grow.
-    """
-    others = jnp.sum(jnp.abs(weights[1:]), axis=0)
-    share = jnp.where(others > 0, -weights[0] / jnp.where(others > 0, others, 1), -jnp.inf)
+    diagnostics = jax.tree.map(jax.lax.stop_gradient, found[1])
+    joint = isinstance(target, Joint) and isinstance(target.targets[0], Laplacian)
+    if not (joint or isinstance(target, Laplacian)):
+        return values, diagnostics
+    calmed, share = _calmed(method, around, values[0] if joint else values, found[1].support)
     share = jax.lax.stop_gradient(share)
-    wild = (share < method.least_dominance) & (diagnostics.tube > 1)
     diagnostics = eqx.tree_at(
         lambda d: d.dominance, diagnostics, share, is_leaf=lambda leaf: leaf is None
     )
-    return jnp.where(wild, _positive(around, diagnostics.support), weights), diagnostics
+    return values.at[0].set(calmed) if joint else calmed, diagnostics
+
+
+# Positive weights have taken over where the share of the centre has fallen so far below what is
+# needed, and support times curvature risen so far above one.
+_SHORT, _BEYOND = 0.1, 0.25
+
+
+def _calmed(method: AbstractMethod, around: Neighborhood, weights, support):
+    """The Laplacian's weights, positive where the surface bends and the centre is not dominant.
+
+    There no polynomial is of use, and a few such rows give an operator growing modes. Weights of
+    one sign are inaccurate, but let nothing grow. Also the share of the centre.
+    """
+    others = jnp.sum(jnp.abs(weights[1:]), axis=0)
+    share = jnp.where(others > 0, -weights[0] / jnp.where(others > 0, others, 1), -jnp.inf)
+    # Without a jump where neighbours enter the support.
+    counted = jnp.where(around.mask, taper(around.squared / support**2), 0)
+    tube = power_mean(_bend(around) * support, counted)
+    part = ramp((method.least_dominance - share) / _SHORT) * ramp((tube - 1) / _BEYOND)
+    blend = weights + part * (_positive(around, support) - weights)
+    return jnp.where(part > 0, blend, weights), share
+
+
+def power_mean(values: Float[Array, "k *p"], counted: Float[Array, "k *p"]) -> Float[Array, "*p"]:
+    """Nearly the largest, and no more than it; smooth also where several are the largest."""
+    largest = jax.lax.stop_gradient(jnp.max(values, axis=0))
+    unit = jnp.where(largest > 0, largest, 1)
+    total = jnp.sum(counted * (values / unit) ** _POWER, axis=0)
+    found = total > 0
+    mean = jnp.where(found, total, 1) / jnp.where(found, jnp.sum(counted, axis=0), 1)
+    return jnp.where(found, unit * mean ** (1 / _POWER), 0)
+
+
+_POWER = 32
+
+
+def ramp(x):
+    """From 0 at 0 to 1 at 1, with two continuous derivatives."""
+    x = jnp.clip(x, 0, 1)
+    return x**3 * (10 - 15 * x + 6 * x**2)
 
 
 # Length of the kernel of positive weights in units of the support: about one spacing.

@@ -14,9 +14,9 @@ from ..cloud import PointCloud
 from ..frames import frames_of
 from ..neighbors import Neighbors
 
-# Numbers held together: points times pairs of neighbours.
+# Numbers held together: points times neighbours.
 _BATCH = 1 << 18
-# Of a circle's squared radius: what a point on it may be off, as on even grids; and of areas.
+# Of directions, and of a centre in its triangle: what round-off makes of even grids.
 _ROUNDOFF = 1e-6
 
 
@@ -33,40 +33,68 @@ def large_triangles(
     Source: after paper 002, Section 3.4.
     """
     x, frames = np.asarray(cloud.points, float), frames_of(np.asarray(cloud.normals, float))
-    indices, mask = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
-    first, second = np.triu_indices(indices.shape[1] - 1, 1)
-    rows = np.flatnonzero(cloud.host_active)
+    indices, mask = np.asarray(neighbors.indices)[:, 1:], np.asarray(neighbors.mask)[:, 1:]
+    rows = np.flatnonzero(cloud.host_active & mask.any(axis=1))
     corners, centers = [np.zeros((0, 3), int)], [np.zeros((0, x.shape[1]))]
-    for row in np.array_split(rows, 1 + len(rows) * len(first) // _BATCH):
-        around, on = indices[row, 1:], mask[row, 1:]
+    for row in np.array_split(rows, 1 + len(rows) * indices.shape[1] // _BATCH):
+        around, on = indices[row], mask[row]
         q = np.einsum("btd,bkd->bkt", frames[row, :2], x[around] - x[row, None])
-        center = _circles(q, on, radius[row], first, second)
-        point, pair = np.nonzero(np.isfinite(center[..., 0]))
-        center, known = center[point, pair], np.max(np.where(on, np.sum(q**2, 2), 0), 1)[point]
-        inside = np.sum(q[point] ** 2, 2) - 2 * np.einsum("mkt,mt->mk", q[point], center)
-        size = np.sum(center**2, axis=1)
-        empty = np.all((inside >= -_ROUNDOFF * size[:, None]) | ~on[point], axis=1)
-        center = center * np.minimum(1, np.sqrt(known / (4 * size)))[:, None]
-        point, pair, center = point[empty], pair[empty], center[empty]
-        corners.append(
-            np.stack([row[point], around[point, first[pair]], around[point, second[pair]]], axis=1)
-        )
-        centers.append(x[row[point]] + np.einsum("mt,mtd->md", center, frames[row[point], :2]))
+        on = on & (np.sum(q**2, axis=2) > 0)
+        point, first, second = _sides(q, on)
+        center = _centers(q[point, first], q[point, second])
+        with np.errstate(invalid="ignore"):
+            large = np.sum(center**2, axis=1) > radius[row[point]] ** 2
+        point, first, second, center = (a[large] for a in (point, first, second, center))
+        known = np.max(np.where(on, np.sum(q**2, axis=2), 0), axis=1)[point]
+        reach = np.minimum(1, np.sqrt(known / (4 * np.sum(center**2, axis=1))))
+        corners.append(np.stack([row[point], around[point, first], around[point, second]], axis=1))
+        away = np.einsum("mt,mtd->md", center * reach[:, None], frames[row[point], :2])
+        centers.append(x[row[point]] + away)
     return np.concatenate(corners), np.concatenate(centers)
 
 
-def _circles(q, on, radius, first, second) -> Float[np.ndarray, "b p 2"]:
-    """Centres of the circles through the origin and two points; NaN where not wanted."""
-    squared = np.sum(q**2, axis=2)
-    a, b, half_a, half_b = q[:, first], q[:, second], squared[:, first] / 2, squared[:, second] / 2
-    area = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+def _sides(q: Float[np.ndarray, "b k 2"], on: Bool[np.ndarray, "b k"]) -> tuple[np.ndarray, ...]:
+    """Rows and two slots of each, of all circles through the origin and two points that are empty.
+
+    By inversion in the unit circle these are straight lines with all points on the side of the
+    origin: the sides of the convex hull. It is walked around from the point that is nearest to the
+    origin, by the least turn each time; of points in line the next one is taken.
+    """
+    squared = np.where(on, np.sum(q**2, axis=2), np.inf)
+    p = q / squared[..., None]
+    row, start = np.arange(len(q)), np.argmin(squared, axis=1)
+    at, found = start, [np.zeros((3, 0), int)]
+    heading = p[row, at] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    for _ in range(q.shape[1]):
+        way = p[row] - p[row, at][:, None]
+        across = heading[:, :1] * way[..., 1] - heading[:, 1:] * way[..., 0]
+        turn = np.arctan2(across, np.einsum("bt,bkt->bk", heading, way))
+        turn = np.where(turn < -np.pi / 2, turn + 2 * np.pi, turn)
+        length = np.sum(way**2, axis=2)
+        turn = np.where(on[row] & (length > 0), turn, np.inf)
+        in_line = turn <= np.min(turn, axis=1, keepdims=True) + _ROUNDOFF
+        after = np.argmin(np.where(in_line & np.isfinite(turn), length, np.inf), axis=1)
+        found.append(np.stack([row, at, after]))
+        heading, goes_on = way[np.arange(len(row)), after], after != start[row]
+        row, at, heading = row[goes_on], after[goes_on], heading[goes_on]
+        if not len(row):
+            break
+    row, at, after = np.concatenate(found, axis=1)
+    a, b = q[row, at], q[row, after]
+    surrounding = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
+    return row[surrounding], at[surrounding], after[surrounding]
+
+
+def _centers(a: Float[np.ndarray, "m 2"], b: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
+    """Centres of the circles through the origin, a and b; NaN where outside of their triangle."""
+    half_a, half_b = np.sum(a**2, axis=1) / 2, np.sum(b**2, axis=1) / 2
+    area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     area = np.where(area**2 > _ROUNDOFF**2 * half_a * half_b, area, np.nan)
-    x = (half_a * b[..., 1] - half_b * a[..., 1]) / area
-    y = (half_b * a[..., 0] - half_a * b[..., 0]) / area
-    u, v = (x * b[..., 1] - y * b[..., 0]) / area, (a[..., 0] * y - a[..., 1] * x) / area
-    wanted = (x**2 + y**2 > radius[:, None] ** 2) & on[:, first] & on[:, second]
-    wanted &= (u >= -_ROUNDOFF) & (v >= -_ROUNDOFF) & (u + v <= 1 + _ROUNDOFF)
-    return np.where(wanted[..., None], np.stack([x, y], axis=-1), np.nan)
+    x = (half_a * b[:, 1] - half_b * a[:, 1]) / area
+    y = (half_b * a[:, 0] - half_a * b[:, 0]) / area
+    u, v = (x * b[:, 1] - y * b[:, 0]) / area, (a[:, 0] * y - a[:, 1] * x) / area
+    inside = (u >= -_ROUNDOFF) & (v >= -_ROUNDOFF) & (u + v <= 1 + _ROUNDOFF)
+    return np.where(inside[:, None], np.stack([x, y], axis=1), np.nan)
 
 
 def large_gaps(

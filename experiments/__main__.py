@@ -121,6 +121,10 @@ EXPERIMENTS = {
         "geodesics",
         "Distances by the heat method: the sphere against great circles, bands on the bunny",
     ),
+    "neck": (
+        "neck",
+        "Mean curvature flow of a smooth dumbbell: the radius of its neck until it pinches off",
+    ),
     "poisson": (
         "poisson",
         "Study: Poisson on ellipsoid, torus and a surface of genus 2; scans; orders and steps",

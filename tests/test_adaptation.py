@@ -96,6 +96,20 @@ def test_corrected_points_are_nearer_and_local_surfaces_better():
     assert np.log2(plain[0] / plain[1]) > 1.8 and np.log2(local[0] / local[1]) > 3.5
 
 
+@pytest.mark.slow
+def test_a_small_spacing_does_not_spread():
+    """Nor does it where what is wanted jumps by a factor of four: there it is graded."""
+    surface = js.discretize(js.sphere(400), method=js.GFDM(degree=2))
+    fine, coarse = 0.045, 0.18
+    wanted = lambda t, surface, *_: jnp.where(surface.cloud.points[:, 2] > 0.8, fine, coarse)
+    found = js.adapt_points(surface, js.Adaptation(wanted))
+    before, z = (np.asarray(s.cloud.points)[:, 2] for s in (surface, found.surface))
+    # Between the densest that holes and crowds allow and what is wanted.
+    cap = 2 * np.pi * 0.2 / fine**2
+    assert 0.5 * cap < np.sum(z > 0.8) < 1.5 * cap
+    assert np.sum(z < 0.3) == np.sum(before < 0.3)
+
+
 def test_gaps_of_curves_are_filled():
     angle = 2 * np.pi * np.arange(60) / 60 + RNG.uniform(-0.049, 0.049, 60)
     x = np.stack([np.cos(angle), np.sin(angle)], axis=1)

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from ..arguments import as_float, finite, instance, real, switched_off, whole
 from ..discretization import Discretization, discretize
 from ..failures import needs_values, raise_at
-from ..interpolation import interpolated, nearest_points
+from ..interpolation import interpolated
 from .holes import border_gaps, close_pairs, fillings
 from .rows import Rows, compact, exchanged
 
@@ -212,22 +212,27 @@ class _Sought(NamedTuple):
         pairs: that crowd, the one that stays first.
         feet, normals: places in the gaps of a border.
         holes: places near holes inside.
+        spacing: wanted in the gaps, then in the holes.
     """
 
     pairs: Int[np.ndarray, "m 2"]
     feet: Float[np.ndarray, "b d"]
     normals: Float[np.ndarray, "b d"]
     holes: Float[np.ndarray, "h d"]
+    spacing: Float[np.ndarray, " m"]
 
 
 def _sought(surface: Discretization, rows: Rows, adaptation: Adaptation) -> _Sought:
     cloud, lists, border = surface.cloud, surface.neighbors, surface.border
     spacing, rank = np.asarray(rows.spacing), np.asarray(rows.rank)
-    feet = normals = np.zeros((0, cloud.dim))
+    feet, normals, wide = np.zeros((0, cloud.dim)), np.zeros((0, cloud.dim)), np.zeros(0)
+    radius = adaptation.hole * spacing
     if border is not None and cloud.dim == 3:
-        feet, normals = map(np.asarray, border_gaps(cloud, border, adaptation.hole * spacing))
+        feet, normals, wide = map(np.asarray, border_gaps(cloud, border, radius))
     pairs = close_pairs(cloud, lists, adaptation.closest * spacing, rank)
-    return _Sought(pairs, feet, normals, fillings(cloud, lists, adaptation.hole * spacing))
+    holes, size = fillings(cloud, lists, radius)
+    wanted = np.concatenate([wide, size]) / adaptation.hole
+    return _Sought(pairs, feet, normals, holes, wanted)
 
 
 def _placed(surface: Discretization, rows: Rows, found: _Sought) -> Rows:
@@ -242,7 +247,8 @@ def _placed(surface: Discretization, rows: Rows, found: _Sought) -> Rows:
     points, normals, fields = _interpolated(cloud, surface.neighbors, degree, at, arrays)
     on_edge = (jnp.asarray(a, points.dtype) for a in (found.feet, found.normals))
     points, normals = (a.at[edge].set(b) for a, b in zip((points, normals), on_edge))
-    spacing = rows.spacing[nearest_points(cloud.points, cloud.active, jnp.asarray(at))]
+    merged = np.minimum(*np.asarray(rows.spacing)[pairs].T)
+    spacing = jnp.asarray(np.concatenate([merged, found.spacing]), rows.spacing.dtype)
     ranks = np.zeros(len(at), rank.dtype)
     ranks[: len(pairs)], ranks[edge] = rank[pairs[:, 0]], 1
     return Rows(points, normals, fields, spacing, jnp.asarray(ranks))

@@ -23,12 +23,12 @@ _ROUNDOFF = 1e-6
 def large_triangles(
     cloud: PointCloud, neighbors: Neighbors, radius: Float[np.ndarray, " n"]
 ) -> tuple[Int[np.ndarray, "m 3"], Float[np.ndarray, "m d"]]:
-    """Corners and circumcentres of triangles whose circumcircle is empty, larger than the radius at
-    one corner, and has its centre inside.
+    """Corners and circumcentres of triangles whose circumcircle is empty, larger than the mean of
+    the radii at its corners, and has its centre inside.
 
-    Surfaces in space. Circles lie in the tangent plane of that corner, and are empty as far as its
-    list tells; of those that reach farther the centre is moved towards the corner, so that the part
-    that is known to be empty is what is returned.
+    Surfaces in space. Circles lie in the tangent plane of the first corner, and are empty as far as
+    its list tells; of those that reach farther the centre is moved towards the corner, so that the
+    part that is known to be empty is what is returned.
 
     Source: after paper 002, Section 3.4.
     """
@@ -42,12 +42,13 @@ def large_triangles(
         on = on & (np.sum(q**2, axis=2) > 0)
         point, first, second = _sides(q, on)
         center = _centers(q[point, first], q[point, second])
+        corner = np.stack([row[point], around[point, first], around[point, second]], axis=1)
         with np.errstate(invalid="ignore"):
-            large = np.sum(center**2, axis=1) > radius[row[point]] ** 2
-        point, first, second, center = (a[large] for a in (point, first, second, center))
+            large = np.sum(center**2, axis=1) > radius[corner].mean(axis=1) ** 2
+        corner, point, center = corner[large], point[large], center[large]
         known = np.max(np.where(on, np.sum(q**2, axis=2), 0), axis=1)[point]
         reach = np.minimum(1, np.sqrt(known / (4 * np.sum(center**2, axis=1))))
-        corners.append(np.stack([row[point], around[point, first], around[point, second]], axis=1))
+        corners.append(corner)
         away = np.einsum("mt,mtd->md", center * reach[:, None], frames[row[point], :2])
         centers.append(x[row[point]] + away)
     return np.concatenate(corners), np.concatenate(centers)
@@ -100,7 +101,8 @@ def _centers(a: Float[np.ndarray, "m 2"], b: Float[np.ndarray, "m 2"]) -> Float[
 def large_gaps(
     cloud: PointCloud, neighbors: Neighbors, radius: Float[np.ndarray, " n"]
 ) -> tuple[Int[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
-    """Neighbours on a plane curve that are farther than twice the radius apart, and the middles."""
+    """Neighbours on a plane curve that are farther apart than the sum of their radii, and the
+    middles."""
     x, n = np.asarray(cloud.points, float), np.asarray(cloud.normals, float)
     indices, mask = np.asarray(neighbors.indices)[:, 1:], np.asarray(neighbors.mask)[:, 1:]
     tangents = np.stack([n[:, 1], -n[:, 0]], axis=1)
@@ -110,14 +112,14 @@ def large_gaps(
     rows = np.flatnonzero(cloud.host_active & np.isfinite(np.min(following, axis=1)))
     pairs = np.stack([rows, indices[rows, slot[rows]]], axis=1)
     ends = x[pairs]
-    wide = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > 2 * radius[rows]
+    wide = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > radius[pairs].sum(axis=1)
     return pairs[wide], ends[wide].mean(axis=1)
 
 
 def border_gaps(
     cloud: PointCloud, border: Border, radius: Float[np.ndarray, " n"]
-) -> tuple[Float[Array, "m 3"], Float[Array, "m 3"]]:
-    """Points of a border, and normals there, in its gaps.
+) -> tuple[Float[Array, "m 3"], Float[Array, "m 3"], Float[np.ndarray, " m"]]:
+    """Points of a border, normals and radii there, in its gaps.
 
     They are longer than the side of an equilateral triangle whose corners are on such a circle.
     """
@@ -126,9 +128,9 @@ def border_gaps(
     slot = np.flatnonzero(own + 1 < mask.sum(axis=1))
     ends = np.stack([rows[slot, own[slot]], rows[slot, own[slot] + 1]])
     x = np.asarray(cloud.points)[ends]
-    wide = np.linalg.norm(x[1] - x[0], axis=1) > math.sqrt(3) * radius[ends].min(axis=0)
+    wide = np.linalg.norm(x[1] - x[0], axis=1) > math.sqrt(3) * radius[ends].mean(axis=0)
     foot, normal, *_ = border.at(cloud, 1, jnp.asarray(slot[wide]), jnp.asarray(x.mean(0)[wide]))
-    return foot, normal
+    return foot, normal, radius[ends].mean(axis=0)[wide]
 
 
 def circumcenters(
@@ -158,24 +160,26 @@ def circumcenters(
 
 def fillings(
     cloud: PointCloud, neighbors: Neighbors, radius: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "m d"]:
-    """Points for the holes, in tangent planes: each as far as the radius from all others.
+) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, " m"]]:
+    """Points for the holes, in tangent planes, and radii there: they are as far from each other.
 
-    What has only points of borders around it is no hole but where the surface ends.
+    These are the means of those of the points around. (Were one of them enough, a small radius
+    would spread from hole to hole over all of a surface.) What has only points of borders around it
+    is no hole but where the surface ends.
     """
     find = large_gaps if cloud.dim == 2 else large_triangles
     around, at = find(cloud, neighbors, radius)
     if cloud.boundary is not None:
-        at = at[~np.asarray(cloud.boundary)[around].all(axis=1)]
-    rows = np.flatnonzero(cloud.host_active)
-    x = np.asarray(cloud.points, float)[rows]
-    size, nearest = cKDTree(x).query(at)
-    wanted = radius[rows][nearest]
+        inside = ~np.asarray(cloud.boundary)[around].all(axis=1)
+        around, at = around[inside], at[inside]
+    x = np.asarray(cloud.points, float)[cloud.host_active]
+    size, wanted = cKDTree(x).query(at)[0], radius[around].mean(axis=1)
     # The largest first: the middle of a hole, not a smaller circle at its rim. A centre above the
     # surface may be nearer to others than to those that it was found from.
     order = np.argsort(-size / wanted, kind="stable")
     at, wanted = at[order], wanted[order]
-    return at[_apart(at, wanted)] if len(at) else at
+    kept = _apart(at, wanted) if len(at) else slice(None)
+    return at[kept], wanted[kept]
 
 
 def _apart(

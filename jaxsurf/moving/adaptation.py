@@ -245,12 +245,12 @@ def _placed(surface: Discretization, rows: Rows, found: _Sought) -> Rows:
     at = np.concatenate([kept, found.feet, found.holes])
     degree, arrays = surface.method.polynomial_degree, (cloud.points, cloud.normals, rows.fields)
     points, normals, fields = _interpolated(cloud, surface.neighbors, degree, at, arrays)
-    on_edge = (jnp.asarray(a, points.dtype) for a in (found.feet, found.normals))
-    points, normals = (a.at[edge].set(b) for a, b in zip((points, normals), on_edge))
+    points[edge], normals[edge] = found.feet, found.normals
     merged = np.minimum(*np.asarray(rows.spacing)[pairs].T)
     spacing = jnp.asarray(np.concatenate([merged, found.spacing]), rows.spacing.dtype)
     ranks = np.zeros(len(at), rank.dtype)
     ranks[: len(pairs)], ranks[edge] = rank[pairs[:, 0]], 1
+    points, normals, fields = jax.tree.map(jnp.asarray, (points, normals, fields))
     return Rows(points, normals, fields, spacing, jnp.asarray(ranks))
 
 
@@ -265,15 +265,19 @@ def conserved(before: Discretization, old, after: Discretization, new) -> PyTree
     return jax.tree.map(corrected, old, new)
 
 
-def _interpolated(cloud, neighbors, degree: int, at, arrays) -> PyTree[Array]:
-    """Points, normals and fields at some places above the surface, in one go."""
+def _interpolated(cloud, neighbors, degree: int, at, arrays) -> PyTree[np.ndarray]:
+    """Points, normals and fields at some places above the surface, in one go.
+
+    In arrays of few sizes, and in NumPy where their number counts: nothing is compiled for it.
+    """
     leaves, structure = jax.tree.flatten(arrays)
     together = jnp.concatenate([u.reshape(len(u), -1) for u in leaves], axis=1)
     count = len(at)
     room = _ROOM * 2 ** max(0, math.ceil(math.log2(count / _ROOM)))
-    padded = jnp.asarray(np.append(at, np.repeat(at[:1], room - count, axis=0), axis=0))
-    found = interpolated(cloud, neighbors, degree, padded.astype(cloud.points.dtype), together)
-    parts = jnp.split(found[:count], np.cumsum([u[0].size for u in leaves])[:-1], axis=1)
+    padded = np.append(at, np.repeat(at[:1], room - count, axis=0), axis=0)
+    padded = jnp.asarray(padded, cloud.points.dtype)
+    found = np.array(interpolated(cloud, neighbors, degree, padded, together))[:count]
+    parts = np.split(found, np.cumsum([u[0].size for u in leaves])[:-1], axis=1)
     parts = [v.reshape(count, *u.shape[1:]).astype(u.dtype) for u, v in zip(leaves, parts)]
     points, normals, fields = jax.tree.unflatten(structure, parts)
-    return points, normals / jnp.linalg.norm(normals, axis=1, keepdims=True), fields
+    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True), fields

@@ -34,6 +34,9 @@ from .surgery import rejoined
 _STRETCH = 1.15
 # Lists are found anew once points outside may come as near as this share of the farthest in them.
 _WORN = 0.75
+# Room to find neighbours in where points are added, in units of what they need: arrays for it that
+# are too short are made anew, and a program with them, which takes many times as long as to search.
+_ROOM = 2.0
 # Sheets that approach are looked at before a step has taken them nearer by this share of the
 # distance at which they touch.
 _PAST = 0.05
@@ -258,11 +261,15 @@ class _Run:
         normals = refit_normals(cloud.points, cloud.normals, surface.neighbors, degree=degree)
         cloud = eqx.tree_at(lambda c: c.normals, cloud, normals)
         if self.search is None:
-            self.search = surface.search()
+            self.search = self.room(surface)
         surface = Discretization(cloud, surface.neighbors, surface.method, surface.border)
         self.count(0, 0, 1)
         if self.adapt is None or not self.change(surface):
             self.begin(surface)
+
+    def room(self, surface: Discretization) -> NeighborSearch:
+        """To find neighbours in, of points that may come to be denser."""
+        return surface.search() if self.adapt is None else surface.search(margin=_ROOM)
 
     def begin(self, surface: Discretization) -> None:
         """On a surface whose lists were found for other points."""
@@ -273,7 +280,7 @@ class _Run:
                 found = surface.moved(cloud.points, cloud.normals, search=self.search)
         if found is None:
             found = discretize(cloud, method=surface.method)
-            self.search = found.search()
+            self.search = self.room(found)
         self.moving = Moving.of(found, self.moving.motion, self.moving.on)
         self.watch()
 

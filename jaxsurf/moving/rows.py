@@ -77,14 +77,15 @@ def compact(surface: Discretization, fields: PyTree[Array]) -> tuple[Discretizat
     on = np.flatnonzero(cloud.host_active)
     row = np.zeros(cloud.n, np.int32)
     row[on] = np.arange(len(on))
-    marked = None if cloud.boundary is None else cloud.boundary[on]
+    kept = lambda u: jnp.asarray(np.asarray(u)[on])
+    marked = None if cloud.boundary is None else kept(cloud.boundary)
     border = surface.border
     if border is not None:
         renamed = lambda names: jnp.asarray(row[np.asarray(names)])
         border = Border(renamed(border.points), renamed(border.rows), border.mask)
-    cloud = PointCloud(cloud.points[on], cloud.normals[on], boundary=marked)
-    lists = Neighbors(jnp.asarray(row[np.asarray(lists.indices)[on]]), lists.mask[on])
-    fields = jax.tree.map(lambda u: u[on], fields)
+    cloud = PointCloud(kept(cloud.points), kept(cloud.normals), boundary=marked)
+    lists = Neighbors(jnp.asarray(row[np.asarray(lists.indices)[on]]), kept(lists.mask))
+    fields = jax.tree.map(kept, fields)
     return Discretization(cloud, lists, surface.method, border), fields
 
 
@@ -108,6 +109,12 @@ def _widened(lists: Neighbors, k: int) -> Neighbors:
 
 
 def _put(rows: np.ndarray, count: int, old: Array, new: Array) -> Array:
-    """Some rows replaced, in an array that gets more rows like its first."""
-    longer = jnp.broadcast_to(old[:1], (count - len(old), *old.shape[1:]))
-    return jnp.concatenate([old, longer]).at[rows].set(new)
+    """Some rows replaced, in an array that gets more rows like its first.
+
+    In NumPy: how many come differs each time, and JAX would compile each time.
+    """
+    before = np.asarray(old)
+    longer = np.broadcast_to(before[:1], (count - len(before), *before.shape[1:]))
+    after = np.concatenate([before, longer])
+    after[rows] = np.asarray(new)
+    return jnp.asarray(after)

@@ -244,7 +244,8 @@ def _means(cloud: PointCloud, stays: Int[np.ndarray, " m"], points, values) -> P
     x = np.asarray(cloud.points, float)[stays]
     distance, near = cKDTree(x).query(points, np.arange(1, 1 + min(_MEAN, len(stays))))
     shares = np.exp(-((distance / distance.mean(axis=1, keepdims=True)) ** 2))
-    shares = jnp.asarray(shares / shares.sum(axis=1, keepdims=True))
-    rows = jnp.asarray(stays[near])
-    mean = lambda u: jnp.einsum("pm,pm...->p...", shares.astype(u.dtype), u[rows])
+    shares, rows = shares / shares.sum(axis=1, keepdims=True), stays[near]
+    mean = lambda u: jnp.asarray(
+        np.einsum("pm,pm...->p...", shares.astype(u.dtype), np.asarray(u)[rows])
+    )
     return jax.tree.map(mean, values)

@@ -2,8 +2,7 @@ r"""The neck of a smooth dumbbell by mean curvature flow, until shortly before i
 
 $\rho^2 = (1 - s^2)(a + b s^2)^2$ with $s = z/l$, a surface of revolution. The radius of its neck is
 held against that of a profile that moves by the same law to 1e-10; the spacing follows the largest
-curvature. With contact the neck is cut when it is as thick as the contact distance d, before its
-time by about d²/4 (a thin neck is a cylinder, $\dot\rho = -1/(2\rho)$): by less, the finer.
+curvature.
 """
 
 from __future__ import annotations
@@ -46,8 +45,10 @@ def spacing(t, surface, fields, args):
     return jnp.clip(share / largest, least, most)
 
 
-def followed(n: int, share: float, parts: tuple[float, ...], bound: float) -> list[Row]:
-    """Without contact, to parts of the time in which the neck pinches off."""
+def followed(
+    n: int, share: float, parts: tuple[float, ...], bound: float
+) -> tuple[list[Row], js.Evolution]:
+    """To parts of the time in which the neck pinches off."""
     radius, pinch = reference()
     times = pinch * np.array(parts)
     cloud = js.level_set(_dumbbell, n=n, bounds=_BOUNDS)
@@ -56,21 +57,25 @@ def followed(n: int, share: float, parts: tuple[float, ...], bound: float) -> li
         js.MeanCurvatureFlow(),
         cloud,
         t1=times[-1],
-        saveat=times[:-1],
+        saveat=[0.0, *times[:-1]],
         method=_METHOD,
         adapt=js.Adaptation(spacing, capacity=int(1.3 * n)),
         args=(share, 0.0, most),
     )
     rows = []
-    for part, t, surface in zip(parts, times, run.surfaces):
+    for part, t, surface in zip(parts, times, run.surfaces[1:]):
         setting = {"method": method_name(_METHOD), "n": surface.n, "t / pinch": part}
         rows.append(Row("radius of the neck, of the profile", radius(t), setting))
         error = abs(narrowest(surface) - radius(t))
         rows.append(Row("error of the radius", error, setting, None, "profile", bound))
-    return rows
+    return rows, run
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    if quick:
-        return followed(1_500, 0.25, (0.5,), 1e-2)
-    return followed(10_000, 0.12, (0.5, 0.9), 1e-3)
+    given = (1_500, 0.25, (0.5,), 1e-2) if quick else (10_000, 0.12, (0.5, 0.9), 1e-3)
+    rows, run = followed(*given)
+    curvature = [surface.mean_curvature for surface in run.surfaces]
+    js.plot_series(
+        run.clouds, curvature, times=run.ts, path=out / "neck.png", label="mean curvature"
+    )
+    return rows

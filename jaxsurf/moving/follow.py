@@ -22,7 +22,7 @@ from ..neighbors import Neighbors
 from ..normals import refit_normals
 from ..renew import NeighborSearch
 from ..time.checkpoint import Checkpoint, digest, read_back, written
-from ..time.integrate import integrate
+from ..time.integrate import IntegrationError, integrate
 from ..time.run import planned
 from .adaptation import Adaptation, changed, conserved
 from .contact import Contact, watched
@@ -212,11 +212,7 @@ class _Run:
             surface, neighbors = self.moving.surface, self.moving.surface.neighbors
             start, uneven = surface.cloud.points, self.adapt is not None
             event = dfx.Event(_Worn(start, neighbors, self.free, uneven))
-            solution = integrate(
-                self.moving, self.state, t0=self.t, t1=end, event=event, **self.options
-            )
-            assert solution.ts is not None and solution.ys is not None
-            reached, new = solution.ts[-1], jax.tree.map(lambda y: y[-1], solution.ys)
+            solution, reached, new = self.stretch(end, event)
             steps, refused = (
                 int(solution.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected")
             )
@@ -236,6 +232,19 @@ class _Run:
             self.tell(reached)
             if solution.result == dfx.RESULTS.event_occurred or float(reached) < float(target):
                 self.renew()
+
+    def stretch(self, end, event: dfx.Event) -> tuple[dfx.Solution, Any, tuple]:
+        """What came of it on the lists that there are, how far it went, and the state there."""
+        given = dict(t0=self.t, t1=end, event=event, **self.options)
+        try:
+            solution = integrate(self.moving, self.state, **given)
+        except IntegrationError as error:
+            # Lists may have ceased to serve before they looked worn: others may take it farther.
+            if error.time - self.t <= _LEAST * (end - self.t):
+                raise
+            return error.solution, np.asarray(error.time, self.t.dtype), error.state
+        assert solution.ts is not None and solution.ys is not None
+        return solution, solution.ts[-1], jax.tree.map(lambda y: y[-1], solution.ys)
 
     def next_look(self) -> float:
         """When sheets are to be looked at again, at the speed that they have now."""

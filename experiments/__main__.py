@@ -121,6 +121,10 @@ EXPERIMENTS = {
         "geodesics",
         "Distances by the heat method: the sphere against great circles, bands on the bunny",
     ),
+    "neck": (
+        "neck",
+        "Mean curvature flow of a smooth dumbbell: the radius of its neck until it pinches off",
+    ),
     "noise": (
         "noise",
         "Study: noise of 1 to 10 % of the spacing: normals, curvature, Laplacians, solutions",

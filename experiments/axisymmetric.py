@@ -70,6 +70,12 @@ def flow(
     return Profile(float(found.t[-1]), lambda t: tuple(found.sol(t).reshape(2, count)))
 
 
+def closing(profile: Profile, at: int) -> float:
+    """When r at a point vanishes: near that its square falls evenly, as that of a cylinder does."""
+    narrow, before = (profile.at(t)[0][at] ** 2 for t in (profile.end, profile.end - 1e-3))
+    return profile.end + 1e-3 * narrow / (before - narrow)
+
+
 def _derivative(values: np.ndarray) -> np.ndarray:
     n = len(values)
     wave = np.fft.rfftfreq(n, 1 / n)

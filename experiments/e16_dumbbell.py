@@ -53,22 +53,40 @@ def shrunk(n: int, t1: float) -> float:
     return float(np.abs(np.linalg.norm(run.clouds[-1].points, axis=1) / exact - 1).max())
 
 
+def uneven(solution: js.Evolution) -> float:
+    """Spread of distances from the middle of the upper end at the last time, over their mean."""
+    x = np.asarray(solution.clouds[-1].points)
+    upper = x[x[:, 2] > 0]
+    radii = np.linalg.norm(upper - (upper.max(axis=0) + upper.min(axis=0)) / 2, axis=1)
+    return float(np.ptp(radii) / np.mean(radii))
+
+
 def run(quick: bool, out: Path) -> list[Row]:
     source = "paper 002, Section 4.2.3"
     n, t1 = (2_000, 0.2) if quick else (8_000, 0.455)
     setting = {"n": n, "t": t1}
     quantity = "relative error of the radius of a sphere"
     rows = [Row(quantity, shrunk(n, t1), setting, None, "r² = 1 - 2t", 1e-4)]
-    times = [0.0, 0.05] if quick else [0.0, 0.05, 0.06, 0.2, 0.4]
-    for least in (0.06,) if quick else (0.05, 0.035, 0.025):
+    times = [0.0, 0.02] if quick else [0.0, 0.03, 0.045, 0.2, 0.4]
+    spacings = (0.06,) if quick else (0.05, 0.035, 0.025)
+    when = []
+    for least in spacings:
         solution = flow(least, 0.06 if quick else 0.6, times)
         events, setting = solution.events, {"least spacing": least}
-        pinched = events["t"][events["pinched"] > 0]
+        pinched, gone = (events["t"][events[what] > 0] for what in ("pinched", "vanished"))
+        when.append((pinched.min(initial=np.inf), gone.max(initial=0)))
         rows.append(Row("necks pinched, at least", len(pinched), setting, None, source, 1, True))
-        rows.append(Row("time of the first pinch", pinched.min(initial=np.inf), setting, 0.05))
+        rows.append(Row("time of the first pinch", when[-1][0], setting, 0.05, source))
         if not quick:
-            gone = events["t"][events["vanished"] > 0]
-            rows.append(Row("time of the end", gone.max(initial=0), setting))
-            rows.append(Row("both ends have vanished: times saved", len(solution.ts), setting))
+            rows.append(Row("time at which nothing is left", when[-1][1], setting))
+            seen = setting | {"t": times[-1]}
+            rows.append(
+                Row("unevenness of the upper end", uneven(solution), seen, None, source, 0.05)
+            )
+    if not quick:
+        for name, (before, after) in zip(("pinch", "end"), np.abs(np.diff(when, axis=0)).T):
+            setting = {"least spacing": " to ".join(map(str, spacings[1:]))}
+            quantity = f"change of the time of the {name}"
+            rows.append(Row(quantity, after, setting, None, "the change before", before))
     js.plot_series(solution.clouds, times=solution.ts, path=out / "e16.png")
     return rows

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 import jaxsurf as js
 from jaxsurf.moving import follow
-from jaxsurf.moving.holes import circumcenters, large_triangles
+from jaxsurf.moving.holes import _sides, circumcenters, large_triangles
 
 RNG = np.random.default_rng(5)
 METHOD = js.GFDM(degree=4)
@@ -54,6 +54,31 @@ def test_holes_are_filled_and_crowds_thinned():
     assert again.surface is found.surface and not again.added + again.merged
 
 
+def test_all_empty_circles_are_found():
+    """Against every two neighbours, on random and even points, all around and to one side."""
+    even = np.stack(np.meshgrid(*[np.arange(-2.0, 3.0)] * 2), axis=-1).reshape(-1, 2)
+    q = RNG.normal(size=(40, 24, 2))
+    q[:5] = even[np.any(even != 0, axis=1)] * np.arange(1.0, 6.0)[:, None, None]
+    q[20:30, :, 0] = np.abs(q[20:30, :, 0])
+    on = RNG.random((40, 24)) < 0.7
+    on[:2] = True
+    row, *pair = _sides(q, on)
+    for i in range(len(q)):
+        x = q[i, on[i]]
+        a, b = (x[slot] for slot in np.triu_indices(len(x), 1))
+        a, b = (side[np.abs(np.linalg.det(np.stack([a, b], 1))) > 1e-9] for side in (a, b))
+        center = lambda a, b: np.linalg.solve(
+            np.stack([a, b], 1), np.stack([np.sum(a**2, 1), np.sum(b**2, 1)], 1)[..., None] / 2
+        )[..., 0]
+        every = center(a, b)
+        inside = np.sum(x**2, 1) - 2 * every @ x.T
+        every = every[np.all(inside > -1e-6 * np.sum(every**2, axis=1, keepdims=True), axis=1)]
+        found = center(*(q[i, slots[row == i]] for slots in pair))
+        far = np.linalg.norm(every[:, None] - found, axis=2)
+        size = np.linalg.norm(every, axis=1)
+        assert np.all(far.min(axis=1) < 1e-6 * size) and np.all(far.min(axis=0) < 1e-6 * size.max())
+
+
 @pytest.mark.slow
 def test_corrected_points_are_nearer_and_local_surfaces_better():
     """Equations 8 and 9 in a form that is exact for circles; polynomials, of higher order."""
@@ -69,6 +94,20 @@ def test_corrected_points_are_nearer_and_local_surfaces_better():
     plain, corrected, local = np.transpose(error)
     assert np.all(corrected <= plain / 2)
     assert np.log2(plain[0] / plain[1]) > 1.8 and np.log2(local[0] / local[1]) > 3.5
+
+
+@pytest.mark.slow
+def test_a_small_spacing_does_not_spread():
+    """Nor does it where what is wanted jumps by a factor of four: there it is graded."""
+    surface = js.discretize(js.sphere(400), method=js.GFDM(degree=2))
+    fine, coarse = 0.045, 0.18
+    wanted = lambda t, surface, *_: jnp.where(surface.cloud.points[:, 2] > 0.8, fine, coarse)
+    found = js.adapt_points(surface, js.Adaptation(wanted))
+    before, z = (np.asarray(s.cloud.points)[:, 2] for s in (surface, found.surface))
+    # Between the densest that holes and crowds allow and what is wanted.
+    cap = 2 * np.pi * 0.2 / fine**2
+    assert 0.5 * cap < np.sum(z > 0.8) < 1.5 * cap
+    assert np.sum(z < 0.3) == np.sum(before < 0.3)
 
 
 def test_gaps_of_curves_are_filled():

@@ -8,6 +8,7 @@ import pytest
 
 import jaxsurf as js
 from jaxsurf.moving import follow
+from jaxsurf.moving.problem import Moving
 
 CLOUD = js.sphere(200)
 SURFACE = js.discretize(CLOUD, method=js.GFDM(degree=2))
@@ -264,3 +265,13 @@ def test_heat_stays_within_borders_that_move_with_it():
     assert jnp.abs(phi - 1.5**-0.5).max() < 1e-2
     mass = run.history["mass"]
     assert abs(mass[1] / mass[0] - 1) < 1e-2
+
+
+def test_where_a_surface_has_no_areas_a_step_is_refused_not_an_error():
+    """A step that is tried may tear it: the rate is then no number, by which steps are refused."""
+    surface = js.discretize(js.sphere(200), method=js.GFDM(degree=2))
+    moving = Moving.of(surface, js.MeanCurvatureFlow(keep_volume=True), None)
+    rate = jax.jit(lambda x: moving.rate(0.0, (x,), None)[0])
+    torn = np.random.default_rng(0).permutation(surface.cloud.points)
+    assert np.all(np.abs(rate(surface.cloud.points)) < 0.1)
+    assert np.all(np.isnan(rate(jnp.asarray(torn))))

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from ..arguments import as_float, finite, flag, instance, real, switched_off, whole
 from ..discretization import Discretization, discretize
 from ..failures import needs_values, raise_at
-from ..interpolation import interpolated, nearest_points
+from ..interpolation import interpolated
 from .holes import border_gaps, close_pairs, fillings
 from .rows import Rows, compact, exchanged
 
@@ -195,7 +195,7 @@ def changed(
         found = _sought(surface, rows, adaptation)
         pairs, new = found.pairs, len(found.feet) + len(found.holes)
         if not len(pairs) + new:
-            return surface, jax.tree.map(jnp.asarray, rows.fields), added, merged
+            return surface, rows.fields, added, merged
         added, merged = added + new, merged + len(pairs)
         coming = _placed(surface, rows, found)
         surface, rows = exchanged(surface, rows, pairs.ravel(), coming, adaptation.capacity)
@@ -212,27 +212,32 @@ class _Sought(NamedTuple):
         pairs: that crowd, the one that stays first.
         feet, normals: places in the gaps of a border.
         holes: places near holes inside.
+        spacing: wanted in the gaps, then in the holes.
     """
 
     pairs: Int[np.ndarray, "m 2"]
     feet: Float[np.ndarray, "b d"]
     normals: Float[np.ndarray, "b d"]
     holes: Float[np.ndarray, "h d"]
+    spacing: Float[np.ndarray, " m"]
 
 
 def _sought(surface: Discretization, rows: Rows, adaptation: Adaptation) -> _Sought:
     cloud, lists, border = surface.cloud, surface.neighbors, surface.border
-    spacing, rank = rows.spacing, rows.rank
-    feet = normals = np.zeros((0, cloud.dim))
+    spacing, rank = np.asarray(rows.spacing), np.asarray(rows.rank)
+    feet, normals, wide = np.zeros((0, cloud.dim)), np.zeros((0, cloud.dim)), np.zeros(0)
+    radius = adaptation.hole * spacing
     if border is not None and cloud.dim == 3:
-        feet, normals = map(np.asarray, border_gaps(cloud, border, adaptation.hole * spacing))
+        feet, normals, wide = map(np.asarray, border_gaps(cloud, border, radius))
     pairs = close_pairs(cloud, lists, adaptation.closest * spacing, rank)
-    return _Sought(pairs, feet, normals, fillings(cloud, lists, adaptation.hole * spacing))
+    holes, size = fillings(cloud, lists, radius)
+    wanted = np.concatenate([wide, size]) / adaptation.hole
+    return _Sought(pairs, feet, normals, holes, wanted)
 
 
 def _placed(surface: Discretization, rows: Rows, found: _Sought) -> Rows:
     """One point for each pair, and one for each gap and hole."""
-    cloud, x, rank = surface.cloud, rows.points, rows.rank
+    cloud, x, rank = surface.cloud, np.asarray(rows.points), np.asarray(rows.rank)
     pairs, edge = found.pairs, slice(len(found.pairs), len(found.pairs) + len(found.feet))
     # What is on a border stays where it is.
     stays = rank[pairs[:, :1]] > 0
@@ -241,10 +246,12 @@ def _placed(surface: Discretization, rows: Rows, found: _Sought) -> Rows:
     degree, arrays = surface.method.polynomial_degree, (cloud.points, cloud.normals, rows.fields)
     points, normals, fields = _interpolated(cloud, surface.neighbors, degree, at, arrays)
     points[edge], normals[edge] = found.feet, found.normals
-    spacing = rows.spacing[np.asarray(nearest_points(cloud.points, cloud.active, jnp.asarray(at)))]
+    merged = np.minimum(*np.asarray(rows.spacing)[pairs].T)
+    spacing = jnp.asarray(np.concatenate([merged, found.spacing]), rows.spacing.dtype)
     ranks = np.zeros(len(at), rank.dtype)
     ranks[: len(pairs)], ranks[edge] = rank[pairs[:, 0]], 1
-    return Rows(points, normals, fields, spacing, ranks)
+    points, normals, fields = jax.tree.map(jnp.asarray, (points, normals, fields))
+    return Rows(points, normals, fields, spacing, jnp.asarray(ranks))
 
 
 def conserved(before: Discretization, old, after: Discretization, new) -> PyTree[Array]:
@@ -259,14 +266,17 @@ def conserved(before: Discretization, old, after: Discretization, new) -> PyTree
 
 
 def _interpolated(cloud, neighbors, degree: int, at, arrays) -> PyTree[np.ndarray]:
-    """Points, normals and fields at some places above the surface, in one go."""
-    leaves, structure = jax.tree.flatten(jax.tree.map(np.asarray, arrays))
-    together = np.concatenate([u.reshape(len(u), -1) for u in leaves], axis=1)
+    """Points, normals and fields at some places above the surface, in one go.
+
+    In arrays of few sizes, and in NumPy where their number counts: nothing is compiled for it.
+    """
+    leaves, structure = jax.tree.flatten(arrays)
+    together = jnp.concatenate([u.reshape(len(u), -1) for u in leaves], axis=1)
     count = len(at)
     room = _ROOM * 2 ** max(0, math.ceil(math.log2(count / _ROOM)))
     padded = np.append(at, np.repeat(at[:1], room - count, axis=0), axis=0)
     padded = jnp.asarray(padded, cloud.points.dtype)
-    found = np.array(interpolated(cloud, neighbors, degree, padded, jnp.asarray(together)))[:count]
+    found = np.array(interpolated(cloud, neighbors, degree, padded, together))[:count]
     parts = np.split(found, np.cumsum([u[0].size for u in leaves])[:-1], axis=1)
     parts = [v.reshape(count, *u.shape[1:]).astype(u.dtype) for u, v in zip(leaves, parts)]
     points, normals, fields = jax.tree.unflatten(structure, parts)

@@ -23,7 +23,7 @@ from ..neighbors import Neighbors
 from ..normals import refit_normals
 from ..renew import NeighborSearch
 from ..time.checkpoint import Checkpoint, digest, read_back, written
-from ..time.integrate import integrate
+from ..time.integrate import IntegrationError, integrate
 from ..time.run import planned
 from .adaptation import Adaptation, changed, conserved
 from .contact import Contact, watched
@@ -35,6 +35,9 @@ from .surgery import rejoined
 _STRETCH = 1.15
 # Lists are found anew once points outside may come as near as this share of the farthest in them.
 _WORN = 0.75
+# Room to find neighbours in where points are added, in units of what they need: arrays for it that
+# are too short are made anew, and a program with them, which takes many times as long as to search.
+_ROOM = 2.0
 # Sheets that approach are looked at before a step has taken them nearer by this share of the
 # distance at which they touch.
 _PAST = 0.05
@@ -214,11 +217,7 @@ class _Run:
             surface, neighbors = self.moving.surface, self.moving.surface.neighbors
             start, uneven = surface.cloud.points, self.adapt is not None
             event = dfx.Event(_Worn(start, neighbors, self.free, uneven))
-            solution = integrate(
-                self.moving, self.state, t0=self.t, t1=end, event=event, **self.options
-            )
-            assert solution.ts is not None and solution.ys is not None
-            reached, new = solution.ts[-1], jax.tree.map(lambda y: y[-1], solution.ys)
+            solution, reached, new = self.stretch(end, event)
             steps, refused = (
                 int(solution.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected")
             )
@@ -238,6 +237,19 @@ class _Run:
             self.tell(reached)
             if solution.result == dfx.RESULTS.event_occurred or float(reached) < float(target):
                 self.renew()
+
+    def stretch(self, end, event: dfx.Event) -> tuple[dfx.Solution, Any, tuple]:
+        """What came of it on the lists that there are, how far it went, and the state there."""
+        given = dict(t0=self.t, t1=end, event=event, **self.options)
+        try:
+            solution = integrate(self.moving, self.state, **given)
+        except IntegrationError as error:
+            # Lists may have ceased to serve before they looked worn: others may take it farther.
+            if error.time - self.t <= _LEAST * (end - self.t):
+                raise
+            return error.solution, np.asarray(error.time, self.t.dtype), error.state
+        assert solution.ts is not None and solution.ys is not None
+        return solution, solution.ts[-1], jax.tree.map(lambda y: y[-1], solution.ys)
 
     def next_look(self) -> float:
         """When sheets are to be looked at again, at the speed that they have now."""
@@ -263,11 +275,15 @@ class _Run:
         normals = refit_normals(cloud.points, cloud.normals, surface.neighbors, degree=degree)
         cloud = eqx.tree_at(lambda c: c.normals, cloud, normals)
         if self.search is None:
-            self.search = surface.search()
+            self.search = self.room(surface)
         surface = Discretization(cloud, surface.neighbors, surface.method, surface.border)
         self.count(0, 0, 1)
         if self.adapt is None or not self.change(surface):
             self.begin(surface)
+
+    def room(self, surface: Discretization) -> NeighborSearch:
+        """To find neighbours in, of points that may come to be denser."""
+        return surface.search() if self.adapt is None else surface.search(margin=_ROOM)
 
     def begin(self, surface: Discretization) -> None:
         """On a surface whose lists were found for other points."""
@@ -283,7 +299,7 @@ class _Run:
                 raise ValueError(
                     f"at t = {float(self.t):g} neighbours could not be found anew: {error}"
                 ) from error
-            self.search = found.search()
+            self.search = self.room(found)
         self.moving = Moving.of(found, self.moving.motion, self.moving.on)
         self.watch()
 

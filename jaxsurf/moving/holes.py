@@ -14,65 +14,95 @@ from ..cloud import PointCloud
 from ..frames import frames_of
 from ..neighbors import Neighbors
 
-# Numbers held together: points times pairs of neighbours.
+# Numbers held together: points times neighbours.
 _BATCH = 1 << 18
-# Of a circle's squared radius: what a point on it may be off, as on even grids; and of areas.
+# Of directions, and of a centre in its triangle: what round-off makes of even grids.
 _ROUNDOFF = 1e-6
 
 
 def large_triangles(
     cloud: PointCloud, neighbors: Neighbors, radius: Float[np.ndarray, " n"]
 ) -> tuple[Int[np.ndarray, "m 3"], Float[np.ndarray, "m d"]]:
-    """Corners and circumcentres of triangles whose circumcircle is empty, larger than the radius at
-    one corner, and has its centre inside.
+    """Corners and circumcentres of triangles whose circumcircle is empty, larger than the mean of
+    the radii at its corners, and has its centre inside.
 
-    Surfaces in space. Circles lie in the tangent plane of that corner, and are empty as far as its
-    list tells; of those that reach farther the centre is moved towards the corner, so that the part
-    that is known to be empty is what is returned.
+    Surfaces in space. Circles lie in the tangent plane of the first corner, and are empty as far as
+    its list tells; of those that reach farther the centre is moved towards the corner, so that the
+    part that is known to be empty is what is returned.
 
     Source: after paper 002, Section 3.4.
     """
     x, frames = np.asarray(cloud.points, float), frames_of(np.asarray(cloud.normals, float))
-    indices, mask = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
-    first, second = np.triu_indices(indices.shape[1] - 1, 1)
-    rows = np.flatnonzero(cloud.host_active)
+    indices, mask = np.asarray(neighbors.indices)[:, 1:], np.asarray(neighbors.mask)[:, 1:]
+    rows = np.flatnonzero(cloud.host_active & mask.any(axis=1))
     corners, centers = [np.zeros((0, 3), int)], [np.zeros((0, x.shape[1]))]
-    for row in np.array_split(rows, 1 + len(rows) * len(first) // _BATCH):
-        around, on = indices[row, 1:], mask[row, 1:]
+    for row in np.array_split(rows, 1 + len(rows) * indices.shape[1] // _BATCH):
+        around, on = indices[row], mask[row]
         q = np.einsum("btd,bkd->bkt", frames[row, :2], x[around] - x[row, None])
-        center = _circles(q, on, radius[row], first, second)
-        point, pair = np.nonzero(np.isfinite(center[..., 0]))
-        center, known = center[point, pair], np.max(np.where(on, np.sum(q**2, 2), 0), 1)[point]
-        inside = np.sum(q[point] ** 2, 2) - 2 * np.einsum("mkt,mt->mk", q[point], center)
-        size = np.sum(center**2, axis=1)
-        empty = np.all((inside >= -_ROUNDOFF * size[:, None]) | ~on[point], axis=1)
-        center = center * np.minimum(1, np.sqrt(known / (4 * size)))[:, None]
-        point, pair, center = point[empty], pair[empty], center[empty]
-        corners.append(
-            np.stack([row[point], around[point, first[pair]], around[point, second[pair]]], axis=1)
-        )
-        centers.append(x[row[point]] + np.einsum("mt,mtd->md", center, frames[row[point], :2]))
+        on = on & (np.sum(q**2, axis=2) > 0)
+        point, first, second = _sides(q, on)
+        center = _centers(q[point, first], q[point, second])
+        corner = np.stack([row[point], around[point, first], around[point, second]], axis=1)
+        with np.errstate(invalid="ignore"):
+            large = np.sum(center**2, axis=1) > radius[corner].mean(axis=1) ** 2
+        corner, point, center = corner[large], point[large], center[large]
+        known = np.max(np.where(on, np.sum(q**2, axis=2), 0), axis=1)[point]
+        reach = np.minimum(1, np.sqrt(known / (4 * np.sum(center**2, axis=1))))
+        corners.append(corner)
+        away = np.einsum("mt,mtd->md", center * reach[:, None], frames[row[point], :2])
+        centers.append(x[row[point]] + away)
     return np.concatenate(corners), np.concatenate(centers)
 
 
-def _circles(q, on, radius, first, second) -> Float[np.ndarray, "b p 2"]:
-    """Centres of the circles through the origin and two points; NaN where not wanted."""
-    squared = np.sum(q**2, axis=2)
-    a, b, half_a, half_b = q[:, first], q[:, second], squared[:, first] / 2, squared[:, second] / 2
-    area = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+def _sides(q: Float[np.ndarray, "b k 2"], on: Bool[np.ndarray, "b k"]) -> tuple[np.ndarray, ...]:
+    """Rows and two slots of each, of all circles through the origin and two points that are empty.
+
+    By inversion in the unit circle these are straight lines with all points on the side of the
+    origin: the sides of the convex hull. It is walked around from the point that is nearest to the
+    origin, by the least turn each time; of points in line the next one is taken.
+    """
+    squared = np.where(on, np.sum(q**2, axis=2), np.inf)
+    p = q / squared[..., None]
+    row, start = np.arange(len(q)), np.argmin(squared, axis=1)
+    at, found = start, [np.zeros((3, 0), int)]
+    heading = p[row, at] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    for _ in range(q.shape[1]):
+        way = p[row] - p[row, at][:, None]
+        across = heading[:, :1] * way[..., 1] - heading[:, 1:] * way[..., 0]
+        turn = np.arctan2(across, np.einsum("bt,bkt->bk", heading, way))
+        turn = np.where(turn < -np.pi / 2, turn + 2 * np.pi, turn)
+        length = np.sum(way**2, axis=2)
+        turn = np.where(on[row] & (length > 0), turn, np.inf)
+        in_line = turn <= np.min(turn, axis=1, keepdims=True) + _ROUNDOFF
+        after = np.argmin(np.where(in_line & np.isfinite(turn), length, np.inf), axis=1)
+        found.append(np.stack([row, at, after]))
+        heading, goes_on = way[np.arange(len(row)), after], after != start[row]
+        row, at, heading = row[goes_on], after[goes_on], heading[goes_on]
+        if not len(row):
+            break
+    row, at, after = np.concatenate(found, axis=1)
+    a, b = q[row, at], q[row, after]
+    surrounding = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
+    return row[surrounding], at[surrounding], after[surrounding]
+
+
+def _centers(a: Float[np.ndarray, "m 2"], b: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
+    """Centres of the circles through the origin, a and b; NaN where outside of their triangle."""
+    half_a, half_b = np.sum(a**2, axis=1) / 2, np.sum(b**2, axis=1) / 2
+    area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     area = np.where(area**2 > _ROUNDOFF**2 * half_a * half_b, area, np.nan)
-    x = (half_a * b[..., 1] - half_b * a[..., 1]) / area
-    y = (half_b * a[..., 0] - half_a * b[..., 0]) / area
-    u, v = (x * b[..., 1] - y * b[..., 0]) / area, (a[..., 0] * y - a[..., 1] * x) / area
-    wanted = (x**2 + y**2 > radius[:, None] ** 2) & on[:, first] & on[:, second]
-    wanted &= (u >= -_ROUNDOFF) & (v >= -_ROUNDOFF) & (u + v <= 1 + _ROUNDOFF)
-    return np.where(wanted[..., None], np.stack([x, y], axis=-1), np.nan)
+    x = (half_a * b[:, 1] - half_b * a[:, 1]) / area
+    y = (half_b * a[:, 0] - half_a * b[:, 0]) / area
+    u, v = (x * b[:, 1] - y * b[:, 0]) / area, (a[:, 0] * y - a[:, 1] * x) / area
+    inside = (u >= -_ROUNDOFF) & (v >= -_ROUNDOFF) & (u + v <= 1 + _ROUNDOFF)
+    return np.where(inside[:, None], np.stack([x, y], axis=1), np.nan)
 
 
 def large_gaps(
     cloud: PointCloud, neighbors: Neighbors, radius: Float[np.ndarray, " n"]
 ) -> tuple[Int[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
-    """Neighbours on a plane curve that are farther than twice the radius apart, and the middles."""
+    """Neighbours on a plane curve that are farther apart than the sum of their radii, and the
+    middles."""
     x, n = np.asarray(cloud.points, float), np.asarray(cloud.normals, float)
     indices, mask = np.asarray(neighbors.indices)[:, 1:], np.asarray(neighbors.mask)[:, 1:]
     tangents = np.stack([n[:, 1], -n[:, 0]], axis=1)
@@ -82,14 +112,14 @@ def large_gaps(
     rows = np.flatnonzero(cloud.host_active & np.isfinite(np.min(following, axis=1)))
     pairs = np.stack([rows, indices[rows, slot[rows]]], axis=1)
     ends = x[pairs]
-    wide = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > 2 * radius[rows]
+    wide = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > radius[pairs].sum(axis=1)
     return pairs[wide], ends[wide].mean(axis=1)
 
 
 def border_gaps(
     cloud: PointCloud, border: Border, radius: Float[np.ndarray, " n"]
-) -> tuple[Float[Array, "m 3"], Float[Array, "m 3"]]:
-    """Points of a border, and normals there, in its gaps.
+) -> tuple[Float[Array, "m 3"], Float[Array, "m 3"], Float[np.ndarray, " m"]]:
+    """Points of a border, normals and radii there, in its gaps.
 
     They are longer than the side of an equilateral triangle whose corners are on such a circle.
     """
@@ -98,9 +128,9 @@ def border_gaps(
     slot = np.flatnonzero(own + 1 < mask.sum(axis=1))
     ends = np.stack([rows[slot, own[slot]], rows[slot, own[slot] + 1]])
     x = np.asarray(cloud.points)[ends]
-    wide = np.linalg.norm(x[1] - x[0], axis=1) > math.sqrt(3) * radius[ends].min(axis=0)
+    wide = np.linalg.norm(x[1] - x[0], axis=1) > math.sqrt(3) * radius[ends].mean(axis=0)
     foot, normal, *_ = border.at(cloud, 1, jnp.asarray(slot[wide]), jnp.asarray(x.mean(0)[wide]))
-    return foot, normal
+    return foot, normal, radius[ends].mean(axis=0)[wide]
 
 
 def circumcenters(
@@ -130,24 +160,26 @@ def circumcenters(
 
 def fillings(
     cloud: PointCloud, neighbors: Neighbors, radius: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "m d"]:
-    """Points for the holes, in tangent planes: each as far as the radius from all others.
+) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, " m"]]:
+    """Points for the holes, in tangent planes, and radii there: they are as far from each other.
 
-    What has only points of borders around it is no hole but where the surface ends.
+    These are the means of those of the points around. (Were one of them enough, a small radius
+    would spread from hole to hole over all of a surface.) What has only points of borders around it
+    is no hole but where the surface ends.
     """
     find = large_gaps if cloud.dim == 2 else large_triangles
     around, at = find(cloud, neighbors, radius)
     if cloud.boundary is not None:
-        at = at[~np.asarray(cloud.boundary)[around].all(axis=1)]
-    rows = np.flatnonzero(cloud.host_active)
-    x = np.asarray(cloud.points, float)[rows]
-    size, nearest = cKDTree(x).query(at)
-    wanted = radius[rows][nearest]
+        inside = ~np.asarray(cloud.boundary)[around].all(axis=1)
+        around, at = around[inside], at[inside]
+    x = np.asarray(cloud.points, float)[cloud.host_active]
+    size, wanted = cKDTree(x).query(at)[0], radius[around].mean(axis=1)
     # The largest first: the middle of a hole, not a smaller circle at its rim. A centre above the
     # surface may be nearer to others than to those that it was found from.
     order = np.argsort(-size / wanted, kind="stable")
     at, wanted = at[order], wanted[order]
-    return at[_apart(at, wanted)] if len(at) else at
+    kept = _apart(at, wanted) if len(at) else slice(None)
+    return at[kept], wanted[kept]
 
 
 def _apart(

@@ -13,6 +13,7 @@ from jaxtyping import Array, PyTree
 from ..arguments import as_float, switched_off
 from ..cloud import PointCloud
 from ..discretization import Discretization
+from ..failures import marking
 from ..functions import numbers_as_arrays
 from ..motion import carried, moved_cloud
 from ..stencils.stencil import Stencil
@@ -91,7 +92,10 @@ class Moving(AbstractEvolution):
         surface = self.surface_at(points)
         problem = None if self.on is None else self.on(surface)
         fields = fields if problem is None else problem.closed(t, fields)
-        velocity = self.motion.velocity(t, surface, fields, args)
+        # A step that is tried may take the surface to where it has none: it is refused, and a
+        # shorter one is tried.
+        with marking():
+            velocity = self.motion.velocity(t, surface, fields, args)
         name = f"velocity of {type(self.motion).__name__}"
         velocity = as_float(velocity, name, points.shape).astype(points.dtype)
         if self.faced is not None:

@@ -31,11 +31,11 @@ class Rows(NamedTuple):
         rank: 0 of points inside, 1 on the border, 2 at corners: which of two stays.
     """
 
-    points: Float[np.ndarray, "n d"]
-    normals: Float[np.ndarray, "n d"]
-    fields: PyTree[np.ndarray]
-    spacing: Float[np.ndarray, " n"]
-    rank: Int[np.ndarray, " n"]
+    points: Float[Array, "n d"]
+    normals: Float[Array, "n d"]
+    fields: PyTree[Array]
+    spacing: Float[Array, " n"]
+    rank: Int[Array, " n"]
 
     @classmethod
     def of(cls, surface: Discretization, fields, spacing: Float[np.ndarray, " n"]) -> Rows:
@@ -44,8 +44,7 @@ class Rows(NamedTuple):
             points = np.asarray(border.points)
             corners = border.corners if cloud.dim == 3 else np.ones(len(points), bool)
             rank[points] = 1 + corners
-        points, normals, fields = jax.tree.map(np.asarray, (cloud.points, cloud.normals, fields))
-        return cls(points, normals, fields, spacing, rank)
+        return cls(cloud.points, cloud.normals, fields, jnp.asarray(spacing), jnp.asarray(rank))
 
 
 def exchanged(
@@ -63,9 +62,8 @@ def exchanged(
     on[free] = True
     rows = jax.tree.map(functools.partial(_put, free, len(on)), rows, coming)
     held = surface.border is not None
-    marked = jnp.asarray((rows.rank > 0) & on) if held else None
-    points, normals = map(jnp.asarray, (rows.points, rows.normals))
-    cloud = PointCloud(points, normals, active=jnp.asarray(on), boundary=marked)
+    marked = jnp.asarray((np.asarray(rows.rank) > 0) & on) if held else None
+    cloud = PointCloud(rows.points, rows.normals, active=jnp.asarray(on), boundary=marked)
     k = min(surface.method.neighbor_count(cloud.dim), int(on.sum()))
     neighbors = find_neighbors(cloud, k)
     neighbors = _widened(neighbors, surface.neighbors.k)
@@ -79,15 +77,15 @@ def compact(surface: Discretization, fields: PyTree[Array]) -> tuple[Discretizat
     on = np.flatnonzero(cloud.host_active)
     row = np.zeros(cloud.n, np.int32)
     row[on] = np.arange(len(on))
-    taken = lambda a: jnp.asarray(np.asarray(a)[on])
-    marked = None if cloud.boundary is None else taken(cloud.boundary)
+    kept = lambda u: jnp.asarray(np.asarray(u)[on])
+    marked = None if cloud.boundary is None else kept(cloud.boundary)
     border = surface.border
     if border is not None:
         renamed = lambda names: jnp.asarray(row[np.asarray(names)])
         border = Border(renamed(border.points), renamed(border.rows), border.mask)
-    cloud = PointCloud(taken(cloud.points), taken(cloud.normals), boundary=marked)
-    lists = Neighbors(jnp.asarray(row[np.asarray(lists.indices)[on]]), taken(lists.mask))
-    fields = jax.tree.map(taken, fields)
+    cloud = PointCloud(kept(cloud.points), kept(cloud.normals), boundary=marked)
+    lists = Neighbors(jnp.asarray(row[np.asarray(lists.indices)[on]]), kept(lists.mask))
+    fields = jax.tree.map(kept, fields)
     return Discretization(cloud, lists, surface.method, border), fields
 
 
@@ -104,13 +102,19 @@ def _more_rows(on: np.ndarray, added: int, capacity: int | None) -> int:
 def _widened(lists: Neighbors, k: int) -> Neighbors:
     """With as many slots."""
     more = ((0, 0), (0, max(0, k - lists.k)))
-    mask = np.pad(np.asarray(lists.mask), more)
-    indices = np.where(mask, np.pad(np.asarray(lists.indices), more), np.arange(lists.n)[:, None])
-    return Neighbors(jnp.asarray(indices.astype(np.int32)), jnp.asarray(mask))
+    indices = np.where(
+        np.pad(lists.mask, more), np.pad(lists.indices, more), np.arange(lists.n)[:, None]
+    )
+    return Neighbors(jnp.asarray(indices.astype(np.int32)), jnp.asarray(np.pad(lists.mask, more)))
 
 
-def _put(rows: np.ndarray, count: int, old: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Some rows replaced, in an array that gets more rows like its first."""
-    longer = np.concatenate([old, np.repeat(old[:1], count - len(old), axis=0)])
-    longer[rows] = new
-    return longer
+def _put(rows: np.ndarray, count: int, old: Array, new: Array) -> Array:
+    """Some rows replaced, in an array that gets more rows like its first.
+
+    In NumPy: how many come differs each time, and JAX would compile each time.
+    """
+    before = np.asarray(old)
+    longer = np.broadcast_to(before[:1], (count - len(before), *before.shape[1:]))
+    after = np.concatenate([before, longer])
+    after[rows] = np.asarray(new)
+    return jnp.asarray(after)

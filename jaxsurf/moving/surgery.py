@@ -211,11 +211,12 @@ def rejoined(
         if not on.any():
             return None, fields, found
         rows, stays = Rows.of(surface, fields, spacing), np.flatnonzero(on)
-        values, wanted = _means(cloud, stays, found.points, (rows.fields, rows.spacing))
-        inside = np.zeros(len(found.points), rows.rank.dtype)
-        coming = Rows(found.points, found.normals, values, wanted, inside)
+        points = jnp.asarray(found.points, cloud.points.dtype)
+        normals = jnp.asarray(found.normals, cloud.points.dtype)
+        values, wanted = _means(cloud, stays, found.points, (fields, rows.spacing))
+        coming = Rows(points, normals, values, wanted, jnp.zeros(len(points), rows.rank.dtype))
         surface, rows = exchanged(surface, rows, found.leaving, coming, capacity)
-        fields, spacing = rows.fields, rows.spacing
+        fields, spacing = rows.fields, np.asarray(rows.spacing)
     crumbs, parts = _crumbs(surface)
     if parts:
         none = np.zeros((0, cloud.dim))
@@ -227,7 +228,7 @@ def rejoined(
         nothing = jax.tree.map(lambda u: u[:0], rows)
         surface, rows = exchanged(surface, rows, crumbs, nothing, capacity)
         fields = rows.fields
-    return surface, jax.tree.map(jnp.asarray, fields), found
+    return surface, fields, found
 
 
 def _crumbs(surface: Discretization) -> tuple[Int[np.ndarray, " m"], int]:
@@ -238,11 +239,13 @@ def _crumbs(surface: Discretization) -> tuple[Int[np.ndarray, " m"], int]:
     return np.flatnonzero((part >= 0) & small[part]), int(small.sum())
 
 
-def _means(cloud: PointCloud, stays: Int[np.ndarray, " m"], points, values) -> PyTree[np.ndarray]:
+def _means(cloud: PointCloud, stays: Int[np.ndarray, " m"], points, values) -> PyTree[Array]:
     """Values at new points: Gaussian means over the points around."""
     x = np.asarray(cloud.points, float)[stays]
     distance, near = cKDTree(x).query(points, np.arange(1, 1 + min(_MEAN, len(stays))))
     shares = np.exp(-((distance / distance.mean(axis=1, keepdims=True)) ** 2))
-    shares = shares / shares.sum(axis=1, keepdims=True)
-    mean = lambda u: np.einsum("pm,pm...->p...", shares.astype(u.dtype), u[stays[near]])
+    shares, rows = shares / shares.sum(axis=1, keepdims=True), stays[near]
+    mean = lambda u: jnp.asarray(
+        np.einsum("pm,pm...->p...", shares.astype(u.dtype), np.asarray(u)[rows])
+    )
     return jax.tree.map(mean, values)

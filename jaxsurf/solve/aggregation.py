@@ -43,11 +43,14 @@ def aggregate(matrix, constant):
             "js.multigrid needs pyamg: pip install 'jaxsurf[multigrid]'. Without it pass "
             "preconditioner=js.jacobi(operator), which takes more steps"
         ) from error
+    # Rows of points that are switched off have none at all.
+    connected = abs(matrix).sum(axis=1).ravel() > abs(matrix.diagonal())
     # Of very many neighbours none is strong beside the centre: then what is strong is weaker.
     for theta in _STRENGTH / 2.0 ** np.arange(8):
         strong = symmetric_strength_of_connection(matrix, theta=theta)
         aggregates = standard_aggregation(strong)[0]
-        if np.mean(np.diff(aggregates.indptr) == 0) < _ALONE:
+        alone = connected & (np.diff(aggregates.indptr) == 0)
+        if np.sum(alone) <= _ALONE * np.sum(connected):
             break
     if aggregates.shape[1] == 0 or aggregates.shape[1] > 0.8 * matrix.shape[0]:
         return None

@@ -130,6 +130,8 @@ def test_another_geometry_compiles_nothing():
     names = measured(js.sphere(900), 125)
     assert names.count("jit(_distances)") == 1 and len(names) < 12, names
     assert not measured(js.ellipsoid(900, (1.0, 0.9, 0.8)), 800)
+    assert not measured(js.ellipsoid(900, (1.0, 0.5, 0.5)), 3)
+    assert not measured(js.torus(900, 1.0, 0.7), 7)
 
 
 def test_a_border():

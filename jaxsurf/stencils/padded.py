@@ -29,6 +29,9 @@ _SCATTER = 12
 _LISTED = 1 / 8
 # Widths tried for a matrix of known usual width: that times powers of this, if not told otherwise.
 _STEP = 0.7
+# By how much another width has to be cheaper than the usual one: else the next surface, which has
+# rows about as long, would be given another width now and then, and be compiled for.
+_CHEAPER = 4 / 3
 
 
 class Table(NamedTuple):
@@ -99,12 +102,14 @@ def _slots(length: np.ndarray, m: int, width: float | None, step: float) -> tupl
     longer = len(length) - np.cumsum(np.bincount(length, minlength=widest + 1))
     overflow = np.append(np.cumsum(longer[::-1])[::-1], 0)
     best = math.inf, 0, 0
+    usual = None if width is None else math.ceil(width)
     for k in _widths(width, step):
         over = int(overflow[min(k, widest + 1)])
         listed = max(math.ceil(m * _LISTED), 1)
         while listed < over:
             listed *= 4
-        best = min(best, (k * m + _SCATTER * listed, k, listed))
+        cost = (k * m + _SCATTER * listed) * (1 if k == usual else _CHEAPER)
+        best = min(best, (cost, k, listed))
         if over == 0:
             return best[1:]
     raise AssertionError("the widths have no end")

@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float
 from .adapt import dominance, is_better, represented, share_wanted, sizes_to_try
 from .adapt import residual_tolerance as residual_tolerance
 from .arguments import as_many, instance, whole
-from .arguments import mask as checked_mask
 from .cloud import PointCloud
 from .compiling import at_once, copying_jit, namespace, sized_jit
 from .failures import (
@@ -25,6 +24,7 @@ from .failures import (
     without_derivatives,
 )
 from .fits.moments import blockwise, in_blocks, out_of_blocks
+from .indices import mask as checked_mask
 from .neighbors import Neighbors, Rows, find_neighbors, nearest_of, switched_on
 from .stencils.gathers import take
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood, weights_by

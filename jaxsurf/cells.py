@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .arguments import as_float, finite, instance, mask, real, whole
+from .arguments import as_float, finite, instance, real, whole
 from .failures import is_concrete, refuse, unchecked
+from .indices import mask
 from .neighbors import Neighbors
 from .sheets import cosine_slack
 

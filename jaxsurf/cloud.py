@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .arguments import POINTS, as_float, is_array, mask
+from .arguments import POINTS, as_float, is_array
 from .failures import is_concrete, not_finite, not_positive, raise_at
+from .indices import mask
 
 # How far the length of a normal may be from one, by the bytes of a number: what normals that were
 # written with eight digits, or normalised in single precision, are off.

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Real
 
-from .arguments import as_float, as_many, differentiable, finite, indices_of, instance, shaped
+from .arguments import as_float, as_many, differentiable, finite, instance, shaped
 from .cloud import PointCloud
 from .failures import is_concrete, raise_at
+from .indices import indices_of
 
 Value = (
     float | Real[Array, "*m"] | Sequence[float] | Callable[[Float[Array, ""]], Real[Array, "*m"]]

@@ -277,3 +277,13 @@ def _bend(points, normals, slots, masks):
         return jnp.where(used, jnp.abs(turn) / jnp.where(used, squared, 1), 0)
 
     return jnp.max(jax.lax.map(bend, (slots, masks)), axis=0)
+
+
+def expected_error(cloud: PointCloud, laplacian, mean) -> Float[Array, ""]:
+    r"""$\|\Delta_S x + (d - 1) H n\|$ of all points over $\|(d - 1) H n\|$."""
+    on, cloud = cloud.active, cloud.seen
+    bent = (cloud.dim - 1) * mean[:, None] * cloud.normals
+    norm = lambda v: jnp.sqrt(jnp.sum(switched_off(on, v) ** 2))
+    # A plane has no curvature: there round-off is told in units of the size.
+    least = norm(jnp.ones_like(cloud.points[:, 0]) / jnp.ptp(cloud.points))
+    return norm(laplacian(cloud.points) + bent) / jnp.maximum(norm(bent), least)

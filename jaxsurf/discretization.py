@@ -12,19 +12,17 @@ from . import curvature, operators, quadrature
 from .arguments import as_float, as_many, finite, instance, switched_off
 from .borders.border import Border
 from .borders.order import find_border
-from .build import build, choose_neighbors
+from .build import choose_neighbors
 from .cloud import PointCloud
-from .compiling import copying_jit
-from .failures import is_concrete, needs_values, raise_at
+from .failures import is_concrete, needs_values
 from .interpolation import interpolated
 from .kept import Kept
-from .motion import CODES, code_of, folded, moved_cloud
+from .motion import code_of, folded, moved_cloud, raise_for
 from .neighbors import Neighbors, switched_on
 from .renew import NeighborSearch, renewed
 from .stencils.algebra import Composition
 from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil
-from .stencils.targets import Gradient, Joint, Laplacian
 from .stencils.usual import USUAL
 from .symmetric import symmetrised
 
@@ -128,21 +126,15 @@ class Discretization(eqx.Module):
 
     @Kept
     def _joint(self) -> tuple[Stencil, Stencil]:
-        """Laplacian and gradient from one factorisation of the moment matrices."""
-        both = self._build(Joint((Laplacian(), Gradient())))
-        laplacian, gradient = _first_and_others(both.weights)
-        return both.of_weights(laplacian), both.of_weights(gradient, (self.cloud.dim,))
+        return operators.laplacian_and_gradient(self.cloud, self.neighbors, self.method)
 
     @Kept
     def _laplacian(self) -> Stencil:
-        return self._build(Laplacian())
+        return operators.laplace_beltrami(self.cloud, self.neighbors, method=self.method)
 
     @Kept
     def _gradient(self) -> Stencil:
-        return self._build(Gradient())
-
-    def _build(self, target) -> Stencil:
-        return build(self.cloud, self.neighbors, self.method, target, True)
+        return operators.surface_gradient(self.cloud, self.neighbors, method=self.method)
 
     # --- curvatures ------------------------------------------------------------------------
 
@@ -186,13 +178,7 @@ class Discretization(eqx.Module):
             >>> bool(coarse.expected_error > 30 * fine.expected_error > 0)
             True
         """
-        cloud = self.cloud.seen
-        bent = (cloud.dim - 1) * self.mean_curvature[:, None] * cloud.normals
-        norm = lambda v: jnp.sqrt(jnp.sum(switched_off(self.cloud.active, v) ** 2))
-        # A plane has no curvature: there round-off is told in units of the size.
-        least = norm(jnp.ones_like(cloud.points[:, 0]) / jnp.ptp(cloud.points))
-        error = norm(self.laplacian(cloud.points) + bent)
-        return error / jnp.maximum(norm(bent), least)
+        return curvature.expected_error(self.cloud, self.laplacian, self.mean_curvature)
 
     # --- integrals -------------------------------------------------------------------------
 
@@ -229,19 +215,19 @@ class Discretization(eqx.Module):
 
     def integrate(self, u: Float[Array, "n *c"]) -> Float[Array, "*c"]:
         r"""$\int_S u\,dS$ of a field or of each of its components."""
-        return _integral(self.areas, self._field(u))
+        return quadrature.integral(self.areas, self._field(u))
 
     def mean(self, u: Float[Array, "n *c"]) -> Float[Array, "*c"]:
         """Integral over area."""
         areas = self.areas
-        return _integral(areas, self._field(u)) / jnp.sum(areas)
+        return quadrature.integral(areas, self._field(u)) / jnp.sum(areas)
 
     def inner(self, u: Float[Array, "n *c"], v: Float[Array, "n *c"]) -> Float[Array, ""]:
         r"""$\int_S u \cdot v\,dS$; of fields with components, the sum over them."""
         u, v = self._field(u), self._field(v)
         if u.shape != v.shape:
             raise ValueError(f"fields have shapes {u.shape} and {v.shape}, expected the same")
-        return jnp.sum(_integral(self.areas, u * v))
+        return jnp.sum(quadrature.integral(self.areas, u * v))
 
     def interpolate(
         self, u: Float[Array, "n *c"], points: Float[Array, "m d"]
@@ -362,9 +348,7 @@ class Discretization(eqx.Module):
 
     def check(self) -> None:
         """Raise a ValueError that names the first point of the least `code` above 0; not traced."""
-        code = np.asarray(self.code)
-        least = np.min(code, where=code > 0, initial=max(CODES))
-        raise_at(code == least, f"point {{i}}: {CODES[int(least)]}", code)
+        raise_for(np.asarray(self.code))
 
 
 def discretize(
@@ -414,13 +398,3 @@ def _operators(cloud, neighbors, method) -> tuple[Stencil, ...]:
     """The Laplacian, and what comes with it for nothing."""
     surface = Discretization(cloud, neighbors, method)
     return surface._joint if method.shares_moments else (surface._laplacian,)
-
-
-@copying_jit
-def _first_and_others(weights):
-    return weights[:, 0], weights[:, 1:]
-
-
-@jax.jit
-def _integral(areas, u):
-    return jnp.tensordot(areas, u, 1)

@@ -12,6 +12,7 @@ from .arguments import count_on, finite, switched_off
 from .build import residual_tolerance
 from .cloud import PointCloud
 from .compiling import sized_jit
+from .failures import raise_at
 from .frames import frames_of
 
 # What a code says of a point.
@@ -160,3 +161,9 @@ def stretch(before, after, neighbors):
     zero = jnp.zeros(len(after), after.dtype)
     old, new = jax.lax.scan(squared, (zero, zero), (neighbors.indices.T, neighbors.mask.T))[0]
     return jnp.where(old > 0, jnp.sqrt(new / jnp.where(old > 0, old, 1)), 1)
+
+
+def raise_for(code: np.ndarray) -> None:
+    """Raise a ValueError that names the first point of the least code above 0."""
+    least = np.min(code, where=code > 0, initial=max(CODES))
+    raise_at(code == least, f"point {{i}}: {CODES[int(least)]}", code)

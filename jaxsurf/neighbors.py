@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .arguments import POINTS, as_float, finite, is_array, point_indices, real, shaped, whole
+from .arguments import POINTS, as_float, finite, is_array, real, shaped, whole
 from .checks import check_count, check_orientation, check_overlap, check_spacing, two_sheets
 from .cloud import PointCloud
 from .failures import (
@@ -22,6 +22,7 @@ from .failures import (
     unchecked,
     without_derivatives,
 )
+from .indices import point_indices
 from .sheets import distance_key, judge, nearest, without_islands
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.spatial import cKDTree
 
-from .arguments import POINTS, as_float, as_many, in_range, instance, mask, switched_off, whole
+from .arguments import POINTS, as_float, as_many, in_range, instance, switched_off, whole
 from .checks import check_count, check_spacing
 from .cloud import PointCloud
 from .compiling import sized_jit
@@ -18,6 +18,7 @@ from .failures import check, is_concrete, needs_values, not_finite, raise_at
 from .fits.kernels import bell, enclosing
 from .fits.monomials import polynomial_count
 from .fits.plane import TangentPlane, dot
+from .indices import mask
 from .neighbors import Neighbors
 from .orient import check_one_sided, orient_normals, plane_normals
 from .sheets import nearest

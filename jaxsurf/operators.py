@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from .arguments import POINTS, as_float, finite, instance, switched_off, whole
 from .build import build
 from .cloud import PointCloud
+from .compiling import copying_jit
 from .failures import is_concrete, refuse, without_derivatives
 from .neighbors import Neighbors, find_neighbors
 from .stencils.algebra import Composition
@@ -19,7 +20,7 @@ from .stencils.dcpse import FlatDCPSE
 from .stencils.gathers import take
 from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil
-from .stencils.targets import Gradient, Hessian, Laplacian, Partial
+from .stencils.targets import Gradient, Hessian, Joint, Laplacian, Partial
 from .stencils.usual import USUAL
 
 
@@ -100,6 +101,18 @@ def surface_gradient(
         True
     """
     return build(cloud, neighbors, method, Gradient(), throw)
+
+
+def laplacian_and_gradient(cloud, neighbors, method) -> tuple[Stencil, Stencil]:
+    """Both from one factorisation of the moment matrices."""
+    both = build(cloud, neighbors, method, Joint((Laplacian(), Gradient())), True)
+    laplacian, gradient = _first_and_others(both.weights)
+    return both.of_weights(laplacian), both.of_weights(gradient, (cloud.dim,))
+
+
+@copying_jit
+def _first_and_others(weights):
+    return weights[:, 0], weights[:, 1:]
 
 
 def surface_divergence(

@@ -114,6 +114,12 @@ def _summed(weights, indices):
     return jnp.zeros(weights.shape[1], weights.dtype).at[indices].add(weights)
 
 
+@jax.jit
+def integral(areas, u):
+    """Of a field or of each of its components."""
+    return jnp.tensordot(areas, u, 1)
+
+
 def cell_weights(
     cloud: PointCloud,
     neighbors: Neighbors,

@@ -27,7 +27,7 @@ from ..compiling import sized_jit
 from ..failures import is_concrete, refuse
 from ..functions import canonical, constant, numbers_as_arrays
 from ..solutions import told
-from ..stencils.algebra import AbstractOperator, Map
+from ..stencils.algebra import AbstractOperator
 from ..stencils.stencil import prepared
 from .krylov import BiCGStab, solve_system, tolerances_as_arrays
 from .precondition import AbstractPreconditioner, multigrid
@@ -177,7 +177,7 @@ class _Problem(eqx.Module):
         """The solution of (L + r') delta = residual; what it is linearised at is a constant."""
         fixed, v = constant((self, v))
         slope = _Slope(fixed.reaction, fixed.args, fixed.field(v))
-        system = System(fixed.operator + Map(slope, len(v)), fixed.closure)
+        system = System(fixed.operator + _Map(slope, len(v)), fixed.closure)
         return solve_system(system.matrix, residual, solver, constant(preconditioner))
 
 
@@ -268,3 +268,20 @@ class _Slope(eqx.Module):
 
     def __call__(self, tangent):
         return jax.jvp(lambda u: self.reaction(u, self.args), (self.u,), (tangent,))[1]
+
+
+class _Map(AbstractOperator):
+    """A linear map of scalar fields given as a function, of which only products are known.
+
+    Args:
+        function: takes and gives a field.
+        n: number of points.
+    """
+
+    function: Callable
+    n: int = eqx.field(static=True, default=0)
+    in_shape = ()
+    out_shape = ()
+
+    def __call__(self, u):
+        return self.function(u)

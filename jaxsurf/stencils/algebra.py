@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ..arguments import as_float, instance, switched_off, whole
+from ..arguments import as_float, instance, per_point, switched_off, whole
 from .lineax import Action
 from .masks import both, either
 
@@ -384,30 +384,8 @@ class Transposed(AbstractOperator):
         return self.operator.to_scipy().T.tocsr()
 
 
-class Map(AbstractOperator):
-    """A linear map of scalar fields given as a function, of which only products are known.
-
-    Args:
-        function: takes and gives a field.
-        n: number of points.
-    """
-
-    function: Callable
-    n: int = eqx.field(static=True, default=0)
-    in_shape = ()
-    out_shape = ()
-
-    def __call__(self, u):
-        return self.function(u)
-
-
 def check_scalar(operator: AbstractOperator) -> None:
     """Refuse operators with components."""
     if operator.in_shape or operator.out_shape:
         shapes = f"{operator.in_shape} to {operator.out_shape}"
         raise ValueError(f"an operator on scalar fields is needed, not from {shapes} components")
-
-
-def per_point(value: ArrayLike, n: int, name: str) -> Float[Array, "*n"]:
-    """A number or one number per point, as an array; else an error."""
-    return as_float(value, name, (), (n,))

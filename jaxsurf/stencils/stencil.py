@@ -16,9 +16,10 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
-from ..arguments import instance, is_array, mask, point_indices, shaped, switched_off
+from ..arguments import instance, is_array, per_point, shaped, switched_off
 from ..failures import check, is_concrete, unchecked
-from .algebra import AbstractOperator, Transposed, per_point
+from ..indices import mask, point_indices
+from .algebra import AbstractOperator, Transposed
 from .gathers import product
 from .masks import both, either
 from .method import Diagnostics

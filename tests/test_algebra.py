@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import jaxsurf as js
-from jaxsurf.stencils.algebra import Map, Transposed
+from jaxsurf.solve.newton import Map
+from jaxsurf.stencils.algebra import Transposed
 
 from .helpers import check_derivatives
 

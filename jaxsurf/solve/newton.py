@@ -177,7 +177,7 @@ class _Problem(eqx.Module):
         """The solution of (L + r') delta = residual; what it is linearised at is a constant."""
         fixed, v = constant((self, v))
         slope = _Slope(fixed.reaction, fixed.args, fixed.field(v))
-        system = System(fixed.operator + _Map(slope, len(v)), fixed.closure)
+        system = System(fixed.operator + Map(slope, len(v)), fixed.closure)
         return solve_system(system.matrix, residual, solver, constant(preconditioner))
 
 
@@ -270,7 +270,7 @@ class _Slope(eqx.Module):
         return jax.jvp(lambda u: self.reaction(u, self.args), (self.u,), (tangent,))[1]
 
 
-class _Map(AbstractOperator):
+class Map(AbstractOperator):
     """A linear map of scalar fields given as a function, of which only products are known.
 
     Args:

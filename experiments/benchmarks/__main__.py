@@ -10,13 +10,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import ModuleType
 
 import jax
 from tqdm import tqdm
 
 from ..report import table as rows_table
 from ..report import write_json
-from . import cases, heat, prompt, shapes
+from . import cases, heat, motion, prompt, shapes
 
 # Measured on a 2-core machine of the same kind, one process each: build s and apply ms at 1e5.
 PEERS = {
@@ -24,6 +25,12 @@ PEERS = {
     "GFDM(degree=4)": ("Compadre GMLS, degree 4, k = 37", "15-22; 8.7 on two threads", "34"),
     "DCPSE(order=2)": ("OpenFPM Surface DC-PSE, order 2, k = 26", "14", "22"),
     "DCPSE(order=4)": ("OpenFPM Surface DC-PSE, order 4, k = 47", "107-125", "41"),
+}
+GROUPS: dict[str, ModuleType] = {
+    "heat": heat,
+    "motion": motion,
+    "prompt": prompt,
+    "shapes": shapes,
 }
 README = Path(__file__).parents[2] / "README.md"
 MARKS = ("<!-- benchmarks: begin -->", "<!-- benchmarks: end -->")
@@ -140,9 +147,7 @@ def table(results: list[dict], quick: bool) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m experiments.benchmarks", description=__doc__)
-    parser.add_argument(
-        "group", nargs="?", default="stencils", choices=["stencils", "heat", "prompt", "shapes"]
-    )
+    parser.add_argument("group", nargs="?", default="stencils", choices=["stencils", *GROUPS])
     parser.add_argument("--quick", action="store_true", help="smaller sizes")
     parser.add_argument("--compadre", action="store_true",
                         help="also beside pycompadre, in the same run (extra: peers)")  # fmt: skip
@@ -155,9 +160,7 @@ def main() -> None:
         jax.config.update("jax_enable_x64", True)
         name, arguments = options.case
         module, _, function = name.rpartition(".")
-        case = getattr(
-            {"": cases, "heat": heat, "prompt": prompt, "shapes": shapes}[module], function
-        )
+        case = getattr(GROUPS.get(module, cases), function)
         print(json.dumps(case(*json.loads(arguments))))
         return
     start, results = time.perf_counter(), []
@@ -168,10 +171,7 @@ def main() -> None:
     ]
     plans = {
         "stencils": lambda quick: plan(quick) + (beside if options.compadre else []),
-        "heat": heat.plan,
-        "prompt": prompt.plan,
-        "shapes": shapes.plan,
-    }
+    } | {group: module.plan for group, module in GROUPS.items()}
     todo = [
         (name, arguments)
         for name, arguments in plans[options.group](options.quick)
@@ -187,6 +187,9 @@ def main() -> None:
         write_json(options.out / "prompt.json", "prompt", rows, time.perf_counter() - start)
         print(rows_table(rows))
         sys.exit(any(row.holds is False for row in rows))
+    if options.group == "motion":
+        print(motion.summary(results))
+        return
     if options.group == "heat":
         print(json.dumps(results, indent=1))
         return

@@ -1,0 +1,108 @@
+r"""A surface that moves: what a step takes in units of a build, and memory of a gradient.
+
+The steps are the paper's on the expanding sphere (E13 and E14, `e14_steps.first_order`): points by
+Euler's move, operators built there, an implicit step of the field.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxsurf as js
+from jaxsurf.motion import carried
+from jaxsurf.moving.adaptation import changed
+from jaxsurf.renew import usual_lists
+
+from .. import e14_steps
+from ..expanding import GROWTH, SIZES, heat, product
+from .timing import first_and_median, peak_gib
+
+_STEPS = 20
+
+
+def plan(quick: bool) -> list[tuple[str, list]]:
+    sizes = [SIZES[0.1]] if quick else [SIZES[0.1], SIZES[0.05], 100_000, 300_000]
+    n, steps = (1_000, 20) if quick else (10_000, 200)
+    todo: list[tuple[str, list]] = [("motion.step", [n]) for n in sizes]
+    todo += [("motion.run", [sizes[0] if quick else SIZES[0.05]])]
+    return [*todo, ("motion.gradient", [n, steps, False]), ("motion.gradient", [n, steps, True])]
+
+
+def step(n: int) -> dict:
+    """Seconds of a step and of its parts, and those in units of a build of the Laplacian."""
+    surface = js.discretize(js.sphere(n), method=js.GFDM(degree=2))
+    x, u, search = surface.cloud.points, product(surface.cloud.points), surface.search()
+    gradient, normals = surface.gradient, surface.cloud.normals
+    fresh = lambda x: js.Discretization(
+        js.PointCloud(x, normals), surface.neighbors, surface.method
+    )
+    spacing = jnp.full(n, np.sqrt(4 * np.pi / n))
+    adapt = js.Adaptation(float(spacing[0]))
+
+    def solved(weights, u):
+        implicit = 1 - 1e-3 * surface.laplacian.of_weights(weights)
+        return js.solve(implicit, u, preconditioner=js.jacobi(implicit), mean_zero=False).value
+
+    parts = {
+        "build": jax.jit(lambda x: fresh(x).laplacian.weights),
+        "neighbours": jax.jit(lambda x: usual_lists(search, fresh(x).cloud, surface.neighbors)[:2]),
+        "normals": jax.jit(lambda x: carried(gradient, normals, x / 1.01, x)),
+        "stencils": jax.jit(lambda x: [o.weights for o in fresh(x)._joint]),
+        "solve": lambda _: jax.jit(solved)(surface.laplacian.weights, u),
+        # Which touches nothing here: what is looked at in vain.
+        "adaptation": lambda _: changed(surface, u, adapt, spacing)[2:],
+    }
+    found = {}
+    for name, part in parts.items():
+        found[name] = first_and_median(lambda part=part: part(1.01 * x), 5)[1]
+    whole = lambda: e14_steps.first_order(surface, _STEPS)
+    found["step"] = first_and_median(whole, 3)[1] / _STEPS
+    return found | {f"{name} / build": s / found["build"] for name, s in found.items()}
+
+
+def run(n: int) -> dict:
+    """Table 2's row of h = 0.05 by `js.evolve`, and what it took."""
+    surface = js.discretize(js.sphere(n), method=js.GFDM(degree=2))
+    given = dict(fields=product(surface.cloud.points), problem=heat, solver=js.RKC2())
+    whole = lambda: js.evolve(GROWTH, surface, t1=1.0, rtol=1e-6, atol=1e-9, **given)  # type: ignore
+    first, again = first_and_median(lambda: whole().fields[-1], 1)
+    return {"first s": first, "s": again, "peak GiB": peak_gib(), **whole().stats}
+
+
+def gradient(n: int, steps: int, reverse: bool) -> dict:
+    """Seconds and peak of a functional of the surface after so many steps, or of its gradient."""
+    surface = js.discretize(js.sphere(n), method=js.GFDM(degree=2))
+
+    def after(scale):
+        velocity = lambda t, surface, fields, args: args[:, None] * surface.cloud.normals
+        end = js.evolve(
+            js.Motion(velocity), surface, t1=0.1, args=scale * product(surface.cloud.points),
+            dt0=0.1 / steps,
+        ).clouds[-1]  # fmt: skip
+        return jnp.sum(end.points**4) / n
+
+    function = jax.jit(jax.grad(after) if reverse else after)
+    first, seconds = first_and_median(lambda: function(0.1), 1)
+    return {"first s": first, "s": seconds, "peak GiB": peak_gib()}
+
+
+def summary(results: list[dict]) -> str:
+    """Tables in Markdown."""
+    parts = ("neighbours", "normals", "stencils", "solve", "adaptation", "step")
+    lines = ["| n | build s | " + " | ".join(f"{part} / build" for part in parts) + " |"]
+    lines += ["|---" * (len(parts) + 2) + "|"]
+    of = lambda case: [r for r in results if r["case"] == f"motion.{case}"]
+    for r in of("step"):
+        v = r["result"]
+        cells = " | ".join(f"{v[f'{part} / build']:.2f}" for part in parts)
+        lines.append(f"| {r['arguments'][0]:,} | {v['build']:.3f} | {cells} |")
+    for r in of("run"):
+        told = ", ".join(f"{k} {v:.3g}" for k, v in r["result"].items() if not isinstance(v, str))
+        lines += ["", f"E13 at n = {r['arguments'][0]:,}: {told}"]
+    for r in of("gradient"):
+        n, steps, reverse = r["arguments"]
+        told = ", ".join(f"{k} {v:.3g}" for k, v in r["result"].items())
+        lines.append(f"{'gradient' if reverse else 'value'} after {steps} steps, n = {n:,}: {told}")
+    return "\n".join(lines)

@@ -2,7 +2,6 @@ r"""From a cloud to stencils: neighbourhoods chosen, weights in blocks, what is 
 
 from __future__ import annotations
 
-import warnings
 from contextlib import nullcontext
 
 import jax
@@ -21,6 +20,7 @@ from .failures import (
     raise_at,
     refuse,
     unchecked,
+    warn,
     without_derivatives,
 )
 from .fits.moments import blockwise, in_blocks, out_of_blocks
@@ -249,12 +249,11 @@ def _report(poor, best, border, chosen, method) -> None:
     failed = (best < method.least_dominance) & ~border[poor]
     if failed.any():
         worst = np.flatnonzero(failed)[np.argmin(best[failed])]
-        warnings.warn(
+        warn(
             f"no neighbourhood of {failed.sum()} points serves {method}: the worst is point "
             f"{poor[worst]}, where the centre has a share of {best[worst]:.2g} of the weights "
             f"among the {chosen[worst]} nearest, {method.least_dominance} is needed; the operator "
-            "may have growing modes (js.spectral_estimate)",
-            stacklevel=4,
+            "may have growing modes (js.spectral_estimate)"
         )
 
 
@@ -285,12 +284,11 @@ def _check(stencil: Stencil, neighbors, method, target, dim) -> None:
     tube = np.where(on, np.asarray(diagnostics.tube), 0)
     if tube.max(initial=0) > 1:
         i = int(tube.argmax())
-        warnings.warn(
+        warn(
             f"the surface bends within one stencil: support x curvature = {tube[i]:.2f} at point "
             f"{i} ({int(np.sum(tube > 1))} points above 1). Use more points there or a smaller "
             "support; js.discretize(cloud, method=...).expected_error tells what it makes of the "
-            "Laplacian",
-            stacklevel=4,
+            "Laplacian"
         )
 
 

@@ -5,7 +5,6 @@ What `jaxsurf demo` computes, and the notebook after it; the command line only p
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from .boundary import Closure
 from .cloud import PointCloud
 from .conditions import dirichlet
 from .curvature import shape_tensor
+from .failures import warn
 from .formats.by_suffix import contents_of
 from .heat import Heat, cell_areas, diffuse, spot
 from .io import read, write
@@ -256,7 +256,7 @@ def save(demo: Demo, out: Path) -> list[Path]:
     """The picture and the ParaView file; a warning for what a missing package prevents."""
     files, cloud, t = [], demo.surface.cloud, demo.heat.frames
     if find_spec("matplotlib") is None:
-        warnings.warn("no picture: pip install 'jaxsurf[pictures]'", stacklevel=2)
+        warn("no picture: pip install 'jaxsurf[pictures]'")
     else:
         panels = {f"{name} curvature": values for name, values in demo.curvature.items()}
         panels["sensitivity of the probe to heat at t = 0"] = demo.sensitivity
@@ -264,7 +264,7 @@ def save(demo: Demo, out: Path) -> list[Path]:
         files.append(out / "demo.png")
         plot_fields(cloud, panels, path=files[-1], view=demo.surface.view, up=demo.surface.up)
     if find_spec("meshio") is None:
-        warnings.warn("no file for ParaView: pip install 'jaxsurf[files]'", stacklevel=2)
+        warn("no file for ParaView: pip install 'jaxsurf[files]'")
     else:
         fields = {f"{name}_curvature": values for name, values in demo.curvature.items()}
         fields |= {f"heat_{i}": u for i, u in enumerate(demo.temperature)}

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import sys
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -163,3 +165,15 @@ def not_positive(x: Any) -> Any:
 def not_finite(x: Any) -> Any:
     """Which rows have an entry that is not finite."""
     return ~np.isfinite(x).all(axis=tuple(range(1, np.ndim(x))))
+
+
+# Packages that stand between a user's line and what is found by it.
+_BETWEEN = {"jaxsurf", "jax", "equinox", "diffrax", "jaxtyping", "beartype", "contextlib"}
+
+
+def warn(message: str) -> None:
+    """A warning that names the line of the user's that led here, once for each such line."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in _BETWEEN:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level)

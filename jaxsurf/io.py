@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from jaxtyping import Array, Float, Shaped
 
 from jaxsurf.arguments import in_range, instance, real, whole
 from jaxsurf.cloud import PointCloud
-from jaxsurf.failures import needs_values, not_finite, raise_at
+from jaxsurf.failures import needs_values, not_finite, raise_at, warn
 from jaxsurf.formats.by_suffix import contents_of
 from jaxsurf.formats.contents import Contents
 from jaxsurf.formats.held import check_name, columns_of, in_space
@@ -108,11 +107,11 @@ def read(
         notes = list(contents.notes)
         triangles = _triangulate(contents, notes) if faces else np.empty((0, 3), np.int64)
         for note in notes:
-            warnings.warn(f"{path}: {note}", stacklevel=2)
+            warn(f"{path}: {note}")
         if not len(triangles):
             return _from_points(contents, n, spacing, degree)
         mesh, kept = clean_mesh(
-            contents.points, triangles, name=str(path), stacklevel=3, largest_part=largest_part
+            contents.points, triangles, name=str(path), largest_part=largest_part
         )
         if n is not None or spacing is not None:
             return sample_mesh(mesh, n=n, spacing=spacing, smooth=smooth, degree=degree, seed=seed)
@@ -198,10 +197,9 @@ def _fitted_normals(path, mesh: TriangleMesh, degree: int) -> np.ndarray:
     _, normals, used = fit_surface(mesh.vertices, mesh.vertex_normals, mesh, degree)
     low = np.count_nonzero(used < degree)
     if low:
-        warnings.warn(
+        warn(
             f"{path}: the neighbours of {low} of {len(used)} vertices allow no fit of degree"
-            f" {degree}; the lowest degree used for a normal is {used.min()}",
-            stacklevel=3,
+            f" {degree}; the lowest degree used for a normal is {used.min()}"
         )
     return normals
 

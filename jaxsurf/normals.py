@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +12,7 @@ from .arguments import POINTS, as_float, as_many, in_range, instance, switched_o
 from .checks import check_count, check_spacing
 from .cloud import PointCloud
 from .compiling import sized_jit
-from .failures import check, is_concrete, needs_values, not_finite, raise_at
+from .failures import check, is_concrete, needs_values, not_finite, raise_at, warn
 from .fits.kernels import bell, enclosing
 from .fits.monomials import polynomial_count
 from .fits.plane import TangentPlane, dot
@@ -142,12 +140,11 @@ def estimate_normals(
     if loose.any():
         normals[loose] = guess[loose]
         worst = np.argmax(turn)
-        warnings.warn(
+        warn(
             f"the surface is not resolved at {loose.sum()} of {n} points: after {iterations} fits "
             f"of degree {degree} their normals still turn, most at point {worst} by "
             f"{turn[worst]:.2g} rad; the normal of the plane through the nearest points is "
-            "taken there",
-            stacklevel=2,
+            "taken there"
         )
     if orient:
         check_one_sided(x, normals, tree)

@@ -11,7 +11,6 @@ all neighbours, exactly as those of a derivative come from its values on monomia
 from __future__ import annotations
 
 import functools
-import warnings
 from collections.abc import Callable
 
 import jax
@@ -22,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 from .build import blocks_of, determined, neighborhood, rows_of
 from .cloud import PointCloud
 from .compiling import sized_jit
-from .failures import is_concrete, refuse
+from .failures import is_concrete, refuse, warn
 from .fits.graph import Graph
 from .fits.moments import blockwise, in_blocks, moment_solve
 from .fits.monomials import polynomial_count
@@ -80,11 +79,10 @@ def cell_areas(
     look = lambda cells: _cell_sizes(cloud, neighbors, degree, cells, outward)
     sizes, closed = _by_enough(look, neighbors.k)
     if is_concrete(closed) and not closed.all():
-        warnings.warn(
+        warn(
             f"the cells of {int((~closed).sum())} points, the first {int(jnp.argmin(closed))}, "
             "are not closed by their neighbours and are given the mean area of theirs: is a "
-            "border not marked?",
-            stacklevel=4,
+            "border not marked?"
         )
     sizes, bad = _completed(sizes, closed, neighbors)
     return refuse(sizes, bad, "the cell of point {i} has the area {v}", sizes)

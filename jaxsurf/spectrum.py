@@ -2,7 +2,6 @@ r"""What an operator does to time integration: its outermost and its rightmost e
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -10,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .arguments import instance, whole
-from .failures import needs_values, raise_at
+from .failures import needs_values, raise_at, warn
 from .stencils.algebra import AbstractOperator, Composition, check_scalar
 
 # Operators on fewer points are treated as matrices.
@@ -112,12 +111,11 @@ def spectral_estimate(operator: AbstractOperator, *, steps: int = 40, degree: in
     if residual > 10 * _RIGHT * radius:
         if n <= _LARGE:
             return _dense(apply, n, scale)
-        warnings.warn(
+        warn(
             f"the abscissa {scale * value.real:.3g} of an operator of radius {scale * radius:.3g} "
             f"is known up to a residual of {scale * residual:.1e} only: many eigenvalues have "
             f"almost the same real part. More than steps = {steps} or a degree above {degree} "
-            "may tell them apart",
-            stacklevel=2,
+            "may tell them apart"
         )
     return Spectrum(*(float(scale * a) for a in (radius, value.real, residual)))
 

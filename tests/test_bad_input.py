@@ -163,3 +163,18 @@ def test_traced_masks_that_leave_nothing():
         counted(jnp.zeros_like(found.mask))
     with pytest.raises(eqx.EquinoxRuntimeError, match="leaves out the point itself"):
         counted(found.mask.at[5, 0].set(False))
+
+
+def test_warnings_name_the_line_that_led_to_them():
+    """Through properties, compiled functions and whatever else stands between."""
+    x = np.asarray(js.ellipsoid(300, (1.0, 1.0, 0.2)).points)
+    cloud = js.PointCloud(x, np.asarray(js.ellipsoid(300, (1.0, 1.0, 0.2)).normals))
+    calls = {
+        "a function": lambda: js.laplace_beltrami(cloud),
+        "a property": lambda: js.discretize(cloud, method=js.GFDM(degree=2)).laplacian,
+        "a function of functions": lambda: js.mean_curvature(cloud),
+    }
+    for name, call in calls.items():
+        with pytest.warns(UserWarning, match="bends within one stencil") as seen:
+            call()
+        assert {warning.filename for warning in seen} == {__file__}, name

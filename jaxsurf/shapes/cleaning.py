@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
@@ -11,6 +9,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxsurf.arguments import on_host
+from jaxsurf.failures import warn
 from jaxsurf.shapes.meshes import (
     EdgeTable,
     TriangleMesh,
@@ -26,7 +25,6 @@ def clean_mesh(
     triangles: Int[Array, "m 3"],
     *,
     name: str = "mesh",
-    stacklevel: int = 2,
     largest_part: bool = False,
 ) -> tuple[TriangleMesh, Int[Array, " kept"]]:
     """Mesh from raw arrays, every repair stated in a warning.
@@ -39,7 +37,6 @@ def clean_mesh(
         vertices: positions, `(n, 3)`.
         triangles: vertex numbers from 0, `(m, 3)`.
         name: what to call the mesh in warnings and errors.
-        stacklevel: of the warnings, as in `warnings.warn`.
         largest_part: where edges have more than two triangles, as where a fin stands on a
             surface, cut the triangles apart there and keep the pieces, from the one with the
             largest area on, that leave no edge with more than two; the others are dropped.
@@ -91,7 +88,7 @@ def clean_mesh(
         ((~chosen).sum(), "{} triangles dropped, so that no edge has more than two"),
     ):
         if count:
-            warnings.warn(f"{name}: " + text.format(count), stacklevel=stacklevel)
+            warn(f"{name}: " + text.format(count))
     return mesh, kept
 
 

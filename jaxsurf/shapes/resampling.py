@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,7 @@ from numpy import ndarray as Array
 
 from jaxsurf.arguments import instance, real, whole
 from jaxsurf.cloud import PointCloud
+from jaxsurf.failures import warn
 from jaxsurf.shapes.closest import ClosestPoint, fit_surface
 from jaxsurf.shapes.meshes import TriangleMesh
 from jaxsurf.shapes.order import sort_cloud
@@ -94,10 +94,9 @@ def sample_mesh(
         points, normals, used = fit_surface(points, normals, mesh, degree)
         low = np.flatnonzero(used < degree)
         if low.size:
-            warnings.warn(
+            warn(
                 f"the vertices near {low.size} of {n} points allow no fit of degree {degree}; the"
-                f" lowest degree used is {used.min()} (0: left on the triangle)",
-                stacklevel=2,
+                f" lowest degree used is {used.min()} (0: left on the triangle)"
             )
     boundary = None if mesh.closed else jnp.arange(n) < len(border)
     cloud = PointCloud(jnp.asarray(points), jnp.asarray(normals), boundary=boundary)
@@ -139,9 +138,8 @@ def _border_points(mesh: TriangleMesh, spacing: float) -> Float[Array, "b 3"]:
         at = np.arange(count) / count * length[-1]
         found.append(np.stack([np.interp(at, length, x) for x in corner.T], axis=1))
     if lost:
-        warnings.warn(
+        warn(
             f"{lost} of {len(mesh.border_loops)} holes are shorter round than 4 spacings of"
-            f" {spacing:.3g} and are not marked as boundary",
-            stacklevel=3,
+            f" {spacing:.3g} and are not marked as boundary"
         )
     return np.concatenate(found)

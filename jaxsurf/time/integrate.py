@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import operator
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, PyTree
 
 from ..arguments import instance, real
-from ..failures import check, is_marking, not_finite, refuse
+from ..failures import check, is_marking, not_finite, refuse, warn
 from ..functions import numbers_as_arrays
 from ..solutions import told
 from .checkpoint import Checkpoint, integrate_in_parts
@@ -136,7 +135,7 @@ def integrate(
         progress=progress and checkpoint is None, throw=throw,
     )  # fmt: skip
     if problem.caution and plan.concrete:
-        warnings.warn(problem.caution, stacklevel=2)
+        warn(problem.caution)
     if checkpoint is None:
         return told(_finished(plan, plan.run, throw))
     part = lambda run: _finished(plan, run, throw)

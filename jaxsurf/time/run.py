@@ -3,7 +3,6 @@ r"""What an integration consists of: terms, solver and controller that go togeth
 from __future__ import annotations
 
 import logging
-import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,7 +14,7 @@ import optimistix as optx
 from jaxtyping import Array, PyTree
 
 from ..arguments import instance, real, whole, within_round_off
-from ..failures import is_concrete, is_marking
+from ..failures import is_concrete, is_marking, warn
 from ..functions import canonical, constant, numbers_as_arrays
 from .asked import check_coefficients, check_saves, checked_rate, checked_state, checked_times
 from .chebyshev import Loop
@@ -302,7 +301,7 @@ def _allowed(max_steps, saveat: dfx.SaveAt, t0, t1, dt0, controller) -> int:
                 f"{float(t1):g}, at most {max_steps} are taken: a longer step, or `max_steps`"
             )
         if steps > _MANY_STEPS / 10:
-            warnings.warn(f"dt0 = {float(dt0):g} makes {steps:.3g} steps", stacklevel=4)
+            warn(f"dt0 = {float(dt0):g} makes {steps:.3g} steps")
     return max_steps
 
 

@@ -11,7 +11,16 @@ from jaxtyping import Array, Float
 
 from jaxsurf.arguments import instance, real, whole
 from jaxsurf.cloud import PointCloud
-from jaxsurf.plot import Colors, Scene, add_bar, check_arguments, draw, pyplot_module, values_of
+from jaxsurf.plot import (
+    Colors,
+    Scene,
+    add_bar,
+    check_arguments,
+    draw,
+    in_rows,
+    pyplot_module,
+    values_of,
+)
 from jaxsurf.raster import camera_of
 from jaxsurf.series import Frame, frames_of
 
@@ -64,8 +73,7 @@ def plot_series(
     real(dpi, "dpi", above=0)
     if path is not None:
         instance(path, (str, Path), "path")
-    columns = min(columns, len(film.frames))
-    rows = -(-len(film.frames) // columns)
+    rows, columns = in_rows(len(film.frames), columns)
     figure = pyplot.figure(figsize=(3.2 * columns + 0.6, 3.0 * rows), layout="constrained")
     axes = [figure.add_subplot(rows, columns, i + 1) for i in range(len(film.frames))]
     for i, ax in enumerate(axes):

@@ -158,8 +158,7 @@ def plot_fields(
         k: None if v is None else values_of(v, cloud, f"field {k!r}") for k, v in fields.items()
     }
     scene = Scene.of(cloud, view, up, pixels)
-    columns = min(columns, len(fields))
-    rows = -(-len(fields) // columns)
+    rows, columns = in_rows(len(fields), columns)
     size = (4.2 * columns + 0.3, 3.8 * rows)
     figure = pyplot.figure(figsize=size, layout="constrained")
     for i, (title, field) in enumerate(values.items()):
@@ -170,6 +169,12 @@ def plot_fields(
         # Written: leave nothing behind for a display.
         pyplot.close(figure)
     return figure
+
+
+def in_rows(count: int, most: int) -> tuple[int, int]:
+    """Rows and columns of so many pictures, at most so many in a row: rows about as long."""
+    rows = -(-count // most)
+    return rows, -(-count // rows)
 
 
 def pyplot_module():

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from ..compiling import AnyArray
 from .states import added, dtype_of
 
 Loop = Literal["checkpointed", "lax", "bounded"]
@@ -95,20 +96,29 @@ def last_stage(
     return eqxi.while_loop(unfinished, step, carry, max_steps=max_stages, kind=loop)[1][0]
 
 
+def nth_stage(increment, y0, k0, stages, *, max_stages: int):
+    """The same on the host, of arrays of NumPy."""
+    forward = _Forward(increment, y0, k0, table(max_stages)[stages])
+    pair = forward.first()
+    for j in range(2, stages + 1):
+        pair = forward.next(j, pair)
+    return pair[0]
+
+
 class _Forward(eqx.Module):
     """One stage from the two before it."""
 
     increment: Callable
-    y0: PyTree[Array]
-    k0: PyTree[Array]
-    rows: Float[Array, "stages 5"]
+    y0: PyTree[AnyArray]
+    k0: PyTree[AnyArray]
+    rows: Float[AnyArray, "stages 5"]
 
-    def first(self) -> tuple[PyTree[Array], PyTree[Array]]:
+    def first(self) -> tuple[PyTree[AnyArray], PyTree[AnyArray]]:
         """Stages 1 and 0."""
         factor = self.rows[1, _MU_K]
         return jax.tree.map(lambda y, k: y + factor * k, self.y0, self.k0), self.y0
 
-    def next(self, j, pair) -> tuple[PyTree[Array], PyTree[Array]]:
+    def next(self, j, pair) -> tuple[PyTree[AnyArray], PyTree[AnyArray]]:
         """Stages j and j - 1 from j - 1 and j - 2."""
         last, before = pair
         row = self.rows[j]

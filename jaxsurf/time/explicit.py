@@ -109,6 +109,11 @@ class RKC2(dfx.AbstractAdaptiveSolver):
         return 3
 
     @property
+    def safety(self) -> float:
+        """What the radius that power iterations find is multiplied by."""
+        return _SAFETY
+
+    @property
     def reach(self) -> float:
         """Longest stable step, times the spectral radius."""
         return (self.max_stages - 1) ** 2 / 1.54 - 1

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from ..compiling import AnyArray, namespace
-from .chebyshev import last_stage, nth_stage
+from .chebyshev import SAFETY, Step, nth_stage, stages_of
 from .explicit import RKC2
 from .implicit import IMEX
 
@@ -92,28 +92,22 @@ class Chebyshev(AbstractAmplification):
 
     Args:
         radius: the spectral radius that it was given, else None.
-        safety: what it multiplies its own estimate by.
         max_stages: the largest number; nothing is known of a step that needs more.
     """
 
     radius: ArrayLike | None
-    safety: float = eqx.field(static=True)
     max_stages: int = eqx.field(static=True)
 
     def __call__(self, dt, parts):
         (z,) = parts
-        numbers = namespace(z)
-        reach = (
-            self.safety * numbers.exp(log_radius(z)) if self.radius is None else dt * self.radius
-        )
-        stages = 1 + numbers.floor(numbers.sqrt(1 + 1.54 * reach))
-        enough = stages <= self.max_stages
-        stages = numbers.where(enough, stages, 2).astype(numbers.int32)
-        given = (lambda _, y: z @ y), _one(z), z, stages
+        numbers, one = namespace(z), _one(z)
+        reach = SAFETY * numbers.exp(log_radius(z)) if self.radius is None else dt * self.radius
+        stages, enough = stages_of(reach, self.max_stages)
         if isinstance(z, np.ndarray):
-            found = nth_stage(*given, max_stages=self.max_stages)
+            found = nth_stage(lambda _, y: z @ y, one, z, stages, max_stages=self.max_stages)
         else:
-            found = last_stage(*given, max_stages=self.max_stages, loop="lax")
+            step = Step(lambda _, y: z @ y, lambda rate: rate, one, z, self.max_stages)
+            found = step.turned(False, stages, z)[0]
         return numbers.where(enough, found, numbers.nan)
 
 
@@ -152,7 +146,7 @@ def amplification_of(solver: dfx.AbstractSolver) -> AbstractAmplification | None
         step = amplification_of(solver.solver)
         return None if step is None else Halved(step)
     if isinstance(solver, RKC2):
-        return Chebyshev(solver.spectral_radius, solver.safety, solver.max_stages)
+        return Chebyshev(solver.spectral_radius, solver.max_stages)
     if isinstance(solver, IMEX):
         known = solver.tableau
         lower = lambda m: _rows([row[:i] for i, row in enumerate(m) if i])

@@ -97,9 +97,20 @@ def check_steps(
 
     if not changes:
         return at(t0)
-    found = jax.lax.map(at, t0 + span * jnp.asarray(_PLACES, t0.dtype))
-    worst = jnp.argmax(jnp.where(found.stable, -jnp.inf, found.excess))
-    return jax.tree.map(lambda x: x[worst], found)
+
+    def worse(worst, t):
+        found = at(t)
+        replace = found.excess > worst.excess
+        return jax.tree.map(lambda new, old: jnp.where(replace, new, old), found, worst), None
+
+    none = jnp.zeros((_rank(u, len(rates)),) * 2, t0.dtype)
+    fine = Verdict(jnp.asarray(True), t0, (none,) * len(rates), jnp.full_like(t0, -jnp.inf))
+    return jax.lax.scan(worse, fine, t0 + span * jnp.asarray(_PLACES, t0.dtype))[0]
+
+
+def _rank(u: PyTree[Array], count: int) -> int:
+    """Of the space for so many parts."""
+    return min(_STEPS * count, sum(leaf.size for leaf in jax.tree.leaves(u)))
 
 
 def projected(
@@ -108,7 +119,7 @@ def projected(
     """The Jacobians of right-hand sides on the sum of their Krylov spaces, of random states."""
     base, unravel = ravel_pytree(u)
     size, count = small(base), len(rates)
-    steps = min(_STEPS * count, base.size)
+    steps = _rank(u, count)
     # Row 0 is no direction: there the rates themselves are computed, by the same program. Then come
     # random starts, which are left out of the space: what no part stretches (the points of a
     # surface, beside fields whose rate hangs on them much) would hide the outermost eigenvalues.

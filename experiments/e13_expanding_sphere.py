@@ -1,9 +1,9 @@
 r"""Heat with a source on the expanding sphere, in space (paper 002, Section 3.7, Table 2).
 
 The relative l2 error at t = 1 of exp(-6 t) x y, which has fallen to 1/400 by then. Integrated so
-accurately that the errors are those of space: steps of fourth order that leave 5e-5 where there
-are 16 (E14). (Of steps that are chosen by a tolerance the early errors count more at the end, as
-the solution falls faster than they do: RKC2 at `rtol=1e-6` leaves 5e-4.)
+accurately that the errors are those of space: steps of fourth order, eight times as many as leave
+5e-5 (E14). (Of steps that are chosen by a tolerance the early errors count more at the end, as the
+solution falls faster than they do: those of RKC2 at `rtol=1e-6` hide the ones of fine points.)
 """
 
 from __future__ import annotations

@@ -337,6 +337,7 @@ def _short(value: Any) -> str:
 
 
 def described(value: Any, array: Any) -> str:
+    """What was given, which as an array is this, as it is told in a message."""
     if isinstance(value, str | bytes) or value is None or array.shape == ():
         return _short(value)
     kind = {"O": "objects", "U": "text", "S": "text"}.get(array.dtype.kind, str(array.dtype))

@@ -12,7 +12,6 @@ import numpy as np
 import scipy.sparse
 
 import jaxsurf as js
-from jaxsurf.renew import usual_lists
 
 from ..report import relative_l2
 from .baselines import numpy_gfdm, plain_jax_gfdm
@@ -195,59 +194,6 @@ def gradient(name: str, n: int, reverse: bool) -> dict:
     _, seconds = first_and_median(lambda: compiled(cloud.points, cloud.normals), 5)
     return {"s": seconds, "compile s": compile_seconds, "peak GiB": peak_gib(),
             "GiB before": before, "temporary MiB": memory.temp_size_in_bytes / 2**20}  # fmt: skip
-
-
-def moved(name: str, n: int) -> dict:
-    """A moved surface in units of building its Laplacian: all of it, areas alone, and gradients.
-
-    Gradients in the points, of areas outside `jit`, where they are several programs, and in it.
-    With the neighbours kept, and found anew: these alone, with all decisions (which need the
-    Laplacian) and the normals, and with the areas; and the gradient through all of it.
-    """
-    method, _ = METHODS[name]
-    surface = js.discretize(js.sphere(n), method=method)
-    x = 1.01 * surface.cloud.points
-    fresh = lambda x: js.Discretization(
-        js.PointCloud(x, surface.cloud.normals), surface.neighbors, method
-    )
-    volume = lambda x: jnp.vdot(fresh(x).areas, jnp.sin(x[:, 2]))
-
-    everything_of = lambda there: (there.laplacian.weights, there.areas, there.code)
-
-    def total(x):
-        """Of all that a motion changes: operators, normals and areas."""
-        there = surface.moved(x, search=search)
-        weights, areas, _ = everything_of(there)
-        return jnp.vdot(areas, jnp.sin(x[:, 2])) + jnp.mean(weights**2) + there.cloud.normals.std()
-
-    search = surface.search()
-    lists = surface.neighbors
-
-    def renewed(x):
-        there = surface.moved(x, search=search)
-        return there.laplacian.weights, there.neighbors, there.code
-
-    calls = {
-        "Laplacian": jax.jit(lambda x: fresh(x).laplacian.weights),
-        "neighbours": jax.jit(lambda x: usual_lists(search, fresh(x).cloud, lists)[:2]),
-        "neighbours, normals, adaptation, Laplacian": jax.jit(renewed),
-        "the same and areas": jax.jit(lambda x: everything_of(surface.moved(x, search=search))),
-        "areas": lambda x: fresh(x).areas,
-        "areas in jit": jax.jit(lambda x: fresh(x).areas),
-        "gradient of areas": jax.grad(volume),
-        "gradient of areas in jit": jax.jit(jax.grad(volume)),
-        "moved": jax.jit(lambda x: everything_of(surface.moved(x))),
-        "gradient of all, neighbours anew": jax.jit(jax.grad(total)),
-    }
-    found: dict = {}
-    for label, call in calls.items():
-        first, seconds = first_and_median(lambda call=call: call(x), 5)
-        found |= {f"{label} s": seconds, f"{label}, first s": first}
-        if label != "Laplacian":
-            found[f"{label} / Laplacian"] = seconds / found["Laplacian s"]
-    forward = found["the same and areas s"]
-    found["reverse / forward"] = found["gradient of all, neighbours anew s"] / forward
-    return found
 
 
 def retraces() -> dict:

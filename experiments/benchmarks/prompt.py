@@ -285,7 +285,7 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
         "",
         lambda m: js.rigid_motion(m.cloud.points[0], (m.number * np.ones(3), np.ones(3))),
     ),
-    "spherical_harmonics": ("closed", "", lambda m: js.spherical_harmonics(m.cloud.points, 4)),
+    "spherical_harmonics": ("closed", "", lambda m: js.spherical_harmonics(m.cloud.normals, 4)),
     "taylor_remainders": (
         "closed",
         "",

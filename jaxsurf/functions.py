@@ -36,6 +36,11 @@ class Traced(eqx.Module):
     def __call__(self, *args):
         return self.program.run(self.constants, args)
 
+    @property
+    def reads_first(self) -> bool:
+        """False if no operation reads the first argument, a number."""
+        return self.program.reads_first
+
 
 def canonical(f: Callable, *examples: Any) -> Traced:
     """The function as a program, for arguments of the shapes and types of the examples.
@@ -101,6 +106,11 @@ class Program:
         self._jaxpr, self._order, self._taken, self._given = jaxpr, order, taken, given
         self._key = (_key(jaxpr), order, taken, given)
         self._hash = hash(self._key)
+
+    @property
+    def reads_first(self) -> bool:
+        inputs = (*self._jaxpr.constvars, *self._jaxpr.invars)
+        return inputs[self._order[1][0]] in _read(self._jaxpr)
 
     def run(self, constants, args):
         leaves, static = eqx.partition(numbers_as_arrays(args), eqx.is_array)

@@ -21,7 +21,7 @@ def stability_polynomial(s, z):
     """What a step of s stages makes of u' = λ u with Δt λ = z."""
     rows = table(s)[s]
     one = np.ones_like(z)
-    last, before = one + rows[1, 2] * z, one
+    last, before = one + rows[1, 3] * z, one
     for j in range(2, s + 1):
         mu, nu, mu_k, gamma_k, _ = rows[j]
         new = (1 - mu - nu) + mu * last + nu * before + mu_k * z * last + gamma_k * z

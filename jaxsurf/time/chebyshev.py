@@ -8,6 +8,10 @@ $$Y_j = (1 - \mu_j - \nu_j) Y_0 + \mu_j Y_{j-1} + \nu_j Y_{j-2}
 K the increment Δt f. Their number is a value, so this is a loop that JAX cannot turn round.
 Here its reverse is written out: stages are kept at intervals of about the square root of the
 largest number, and in between computed again.
+
+A turn of the loop makes a stage and then the rate there, that of the last one being the rate at
+the end of the step; power iterations for the spectral radius are turns of the same loop. So a rate,
+which may take seconds to compile, is compiled once.
 """
 
 from __future__ import annotations
@@ -15,16 +19,18 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from .states import added, dtype_of
+from ..compiling import AnyArray
+from ..functions import constant
+from .states import added, dtype_of, length, small
 
 Loop = Literal["checkpointed", "lax", "bounded"]
 
@@ -32,14 +38,16 @@ Loop = Literal["checkpointed", "lax", "bounded"]
 _DAMPING = 2 / 13
 # Columns of the table.
 _MU, _NU, _MU_K, _GAMMA_K, _NODE = range(5)
+# A power iteration sees the radius from below.
+SAFETY = 1.2
 
 
 @functools.cache
 def table(max_stages: int) -> np.ndarray:
     """Coefficients `(s, j, 5)` of stage j of s, for every s up to the largest.
 
-    Columns: μ, ν, μ̃, γ̃, and the node c of stage j - 1. (Sommeijer, Shampine and Verwer 1998,
-    eqs. 2.4 to 2.8.)
+    Columns: μ, ν, μ̃, γ̃, and the node c of stage j. (Sommeijer, Shampine and Verwer 1998,
+    eqs. 2.4 to 2.8.) The first two stages name Y_0 and K_0 as such, not as stages before them.
     """
     rows = np.zeros((max_stages + 1, max_stages + 1, 5))
     for s in range(2, max_stages + 1):
@@ -56,64 +64,192 @@ def table(max_stages: int) -> np.ndarray:
         c = np.zeros(s + 1)
         c[2:] = w1 * t[2, 2:] / t[1, 2:]
         c[1] = c[2] / t[1, 2]
-        rows[s, 1, _MU_K] = b[1] * w1
-        rows[s, 1, _MU] = 1
+        rows[s, 1, _GAMMA_K] = b[1] * w1
         rows[s, 2 : s + 1, _MU] = 2 * b[2:] * w0 / b[1:-1]
-        rows[s, 2 : s + 1, _NU] = -b[2:] / b[:-2]
+        rows[s, 3 : s + 1, _NU] = -b[3:] / b[1:-2]
         rows[s, 2 : s + 1, _MU_K] = 2 * b[2:] * w1 / b[1:-1]
         rows[s, 2 : s + 1, _GAMMA_K] = -(1 - b * t[0])[1:-1] * rows[s, 2 : s + 1, _MU_K]
-        rows[s, 2 : s + 1, _NODE] = c[1:-1]
+        rows[s, 1 : s + 1, _NODE] = (*c[1:s], 1)
     return rows
 
 
-def last_stage(
-    increment: Callable[[Array, PyTree], PyTree],
-    y0: PyTree[Array],
-    k0: PyTree[Array],
-    stages: Int[Array, ""],
-    *,
-    max_stages: int,
-    loop: Loop,
-) -> PyTree[Array]:
-    """The last of the stages of one step.
+class Radius(NamedTuple):
+    """What is known of the spectral radius of the Jacobian, a constant to differentiation.
 
     Args:
-        increment: (c, y) -> Δt times the right-hand side at t + c Δt.
-        y0, k0: the state, and its increment.
-        stages: how many, at least 2.
-        max_stages: the largest number there may be.
-        loop: how it can be differentiated, see `RKC2`.
+        value: an estimate.
+        direction: field that the Jacobian stretches most; None where the value is given.
+        turns: of power iterations, before the stages.
     """
-    rows = jnp.asarray(table(max_stages), dtype_of(y0))[stages]
-    if loop == "checkpointed":
-        increment = eqx.filter_closure_convert(increment, rows[0, _NODE], y0)
-        return _last((increment, y0, k0), rows, stages)
-    forward = _Forward(increment, y0, k0, rows)
-    carry = (jnp.asarray(2, stages.dtype), forward.first())
-    unfinished = lambda carry: carry[0] <= stages
-    step = lambda carry: (carry[0] + 1, forward.next(*carry))
-    return eqxi.while_loop(unfinished, step, carry, max_steps=max_stages, kind=loop)[1][0]
+
+    value: Float[Array, ""]
+    direction: PyTree[Array] | None = None
+    turns: Int[Array, ""] | int = 0
+
+
+def stages_of(need, max_stages: int):
+    """How many stages there are for Δt times the radius; 2, and False, where more are needed."""
+    numbers = np if isinstance(need, np.ndarray | np.generic) else jnp
+    stages = 1 + numbers.floor(numbers.sqrt(1 + 1.54 * need))
+    enough = stages <= max_stages  # also False for a radius that is not finite
+    return numbers.where(enough, stages, 2).astype(numbers.int32), enough
+
+
+class End(NamedTuple):
+    """What a step ends with.
+
+    Args:
+        y, rate: the last stage and the right-hand side there.
+        radius: of which the last two follow.
+        stages, enough: see `stages_of`.
+    """
+
+    y: PyTree[Array]
+    rate: PyTree[Array]
+    radius: Radius
+    stages: Int[Array, ""]
+    enough: Bool[Array, ""]
+
+
+class Step(eqx.Module):
+    """One step, whose rate stands at one place of the program.
+
+    Args:
+        rate: (c, y) -> right-hand side at the time t + c Δt.
+        weigh: right-hand side -> increment.
+        y0, rate0: the state, and the right-hand side there.
+        max_stages: the largest number of stages.
+    """
+
+    rate: Callable
+    weigh: Callable
+    y0: PyTree[AnyArray]
+    rate0: PyTree[AnyArray]
+    max_stages: int = eqx.field(static=True)
+
+    def __call__(self, dt, radius: Radius, loop: Loop) -> End:
+        """The end of the step, of length dt.
+
+        Args:
+            radius: what is known of it.
+            loop: how it can be differentiated, see `RKC2`.
+        """
+        dt, radius = constant((jnp.abs(dt), radius))
+        if loop == "checkpointed":
+            rate = eqx.filter_closure_convert(self.rate, dt, self.y0)
+            weigh = eqx.filter_closure_convert(self.weigh, self.rate0)
+            return _end(((rate, weigh), self.y0, self.rate0), dt, radius, self.max_stages)
+        if radius.direction is not None:
+            fixed = constant(self)
+            start = added(fixed.rate0, radius.direction)
+            _, rate, stretched = fixed.turned(True, radius.turns, start)
+            radius = constant(fixed.seen(radius, rate, stretched, radius.turns > 0))
+        stages, enough = stages_of(dt * radius.value, self.max_stages)
+        y, rate, _ = self.turned(False, stages, self.rate0, loop)
+        return End(y, rate, radius, stages, enough)
+
+    def end(self, dt, radius: Radius) -> End:
+        """The same by one loop: its first turn are power iterations, if any, its second stages."""
+
+        def phase(carry):
+            i, end = carry
+            power, radius = i == 0, end.radius
+            start, count = self.rate0, end.stages
+            if radius.direction is not None:
+                start = added(start, radius.direction)
+                count = jnp.where(power, radius.turns, count)
+            y, rate, stretched = self.turned(power, count, start)
+            if radius.direction is not None:
+                radius = self.seen(radius, rate, stretched, power)
+            stages, enough = stages_of(dt * radius.value, self.max_stages)
+            return i + 1, End(y, rate, radius, stages, enough)
+
+        known = End(self.y0, self.rate0, radius, *stages_of(dt * radius.value, self.max_stages))
+        if radius.direction is None:
+            return phase((1, known))[1]
+        start = jnp.where(jnp.asarray(radius.turns) > 0, 0, 1), known
+        return jax.lax.while_loop(lambda carry: carry[0] < 2, phase, start)[1]
+
+    def turned(self, power, count, rate: PyTree[Array], loop: Loop = "lax"):
+        """The last of so many power iterations or stages, the rate there, and how far that is
+        from the rate at the start where it is of a power iteration.
+
+        Args:
+            power: whether they are that.
+            rate: for those, the rate at the start and a direction added to it.
+        """
+        rows = jnp.asarray(table(self.max_stages), dtype_of(self.y0))[jnp.where(power, 0, count)]
+        size = small(self.y0)
+        away = lambda rate: length(jax.tree.map(jnp.subtract, rate, self.rate0))
+
+        def turn(carry):
+            j, last, before, rate, stretched = carry
+            row = rows[j]
+            scale = jnp.where(power & (stretched > 0), size / stretched, 0)
+            y = self.stage(row, last, before, rate)
+            y = jax.tree.map(lambda y, a, b: y + scale * (a - b), y, rate, self.rate0)
+            rate = self.rate(row[_NODE], y)
+            stretched = jax.lax.cond(power, away, lambda _: stretched, rate)
+            return j + 1, y, last, rate, stretched
+
+        count = jnp.asarray(count)
+        start = jnp.asarray(1, count.dtype), self.y0, self.y0, rate, away(rate)
+        unfinished = lambda carry: carry[0] <= count
+        if loop == "lax":
+            _, y, _, rate, stretched = jax.lax.while_loop(unfinished, turn, start)
+        else:
+            most = self.max_stages
+            end = eqxi.while_loop(unfinished, turn, start, max_steps=most, kind=loop)
+            _, y, _, rate, stretched = end
+        return y, rate, stretched
+
+    def seen(self, radius: Radius, rate: PyTree[Array], stretched, power) -> Radius:
+        """What power iterations tell, if there were any."""
+        keep = power & (stretched > 0)
+        value = jnp.where(power, SAFETY * stretched / small(self.y0), radius.value)
+        direction = jax.tree.map(
+            lambda a, b, d: jnp.where(keep, a - b, d), rate, self.rate0, radius.direction
+        )
+        return Radius(value, direction, radius.turns)
+
+    def stage(self, row, last, before, rate) -> PyTree[Array]:
+        """A stage from the two before it and the rate at the last."""
+        mu, nu = row[_MU], row[_NU]
+        push = jax.tree.map(lambda a, b: row[_MU_K] * a + row[_GAMMA_K] * b, rate, self.rate0)
+        return jax.tree.map(
+            lambda y0, y, z, k: (1 - mu - nu) * y0 + mu * y + nu * z + k,
+            self.y0, last, before, self.weigh(push),
+        )  # fmt: skip
+
+
+def nth_stage(increment, y0, k0, stages, *, max_stages: int):
+    """The last of so many stages, on the host."""
+    forward = _Forward(increment, y0, k0, table(max_stages)[stages])
+    pair = forward.first()
+    for j in range(2, stages + 1):
+        pair = forward.next(j, pair)
+    return pair[0]
 
 
 class _Forward(eqx.Module):
     """One stage from the two before it."""
 
     increment: Callable
-    y0: PyTree[Array]
-    k0: PyTree[Array]
-    rows: Float[Array, "stages 5"]
+    y0: PyTree[AnyArray]
+    k0: PyTree[AnyArray]
+    rows: Float[AnyArray, "stages 5"]
 
-    def first(self) -> tuple[PyTree[Array], PyTree[Array]]:
+    def first(self) -> tuple[PyTree[AnyArray], PyTree[AnyArray]]:
         """Stages 1 and 0."""
-        factor = self.rows[1, _MU_K]
+        factor = self.rows[1, _GAMMA_K]
         return jax.tree.map(lambda y, k: y + factor * k, self.y0, self.k0), self.y0
 
-    def next(self, j, pair) -> tuple[PyTree[Array], PyTree[Array]]:
+    def next(self, j, pair) -> tuple[PyTree[AnyArray], PyTree[AnyArray]]:
         """Stages j and j - 1 from j - 1 and j - 2."""
         last, before = pair
         row = self.rows[j]
         mu, nu = row[_MU], row[_NU]
-        k = self.increment(row[_NODE], last)
+        k = self.increment(self.rows[j - 1, _NODE], last)
         new = jax.tree.map(
             lambda y0, y, z, k, k0: (
                 (1 - mu - nu) * y0 + mu * y + nu * z + row[_MU_K] * k + row[_GAMMA_K] * k0
@@ -132,55 +268,59 @@ class _Forward(eqx.Module):
 
 
 @eqx.filter_custom_vjp
-def _last(inputs, rows, stages):
-    increment, y0, k0 = inputs
-    forward = _Forward(increment, y0, k0, rows)
-    return forward.upto(jnp.asarray(1, stages.dtype), forward.first(), stages)[0]
+def _end(inputs, dt, radius, max_stages):
+    (rate, weigh), y0, rate0 = inputs
+    return Step(rate, weigh, y0, rate0, max_stages).end(dt, radius)
 
 
-@_last.def_fwd
-def _last_forward(perturbed, inputs, rows, stages):
-    return _last(inputs, rows, stages), None
+@_end.def_fwd
+def _end_forward(perturbed, inputs, dt, radius, max_stages):
+    end = _end(inputs, dt, radius, max_stages)
+    return end, (end.stages, end.y)
 
 
-@_last.def_bwd
-def _last_reverse(residuals, cotangent, perturbed, inputs, rows, stages):
-    increment, y0, k0 = inputs
-    parameters, fixed = eqx.partition(increment, perturbed[0])
-    forward = _Forward(increment, y0, k0, rows)
-    length = math.isqrt(rows.shape[0] - 1) + 1  # stages of an interval
+@_end.def_bwd
+def _end_reverse(residuals, cotangent, perturbed, inputs, dt, radius, max_stages):
+    functions, y0, rate0 = inputs
+    stages, y1 = residuals
+    parameters, fixed = eqx.partition(functions, perturbed[0])
+    rows = jnp.asarray(table(max_stages), dtype_of(y0))[stages]
+    rate, weigh = functions
+    forward = _Forward(lambda c, y: weigh(rate(c, y)), y0, weigh(rate0), rows)
+    interval_length = math.isqrt(max_stages) + 1  # stages of an interval
     one = jnp.asarray(1, stages.dtype)
 
     def pulled(j, y, c):
         """Cotangents of the parameters and of y for one of the increment at stage j - 1."""
 
         def moved(parameters, y):
-            return eqx.combine(parameters, fixed)(rows[j, _NODE], y)
+            rate, weigh = eqx.combine(parameters, fixed)
+            return weigh(rate(rows[j - 1, _NODE], y))
 
         return jax.vjp(moved, parameters, y)[1](c)
 
     # Stages before 1, 1 + length, 1 + 2 length, ...: where the intervals start.
-    intervals = (stages - 2) // length  # whole ones before the last
-    starts = _room(length, (y0, y0))
+    intervals = (stages - 2) // interval_length  # whole ones before the last
+    starts = _room(interval_length, (y0, y0))
 
     def note(i, carry):
         pair, starts = carry
         starts = _put(starts, i, pair)
-        return forward.upto(1 + i * length, pair, 1 + (i + 1) * length), starts
+        return forward.upto(1 + i * interval_length, pair, 1 + (i + 1) * interval_length), starts
 
     pair, starts = jax.lax.fori_loop(0 * one, intervals, note, (forward.first(), starts))
     starts = _put(starts, intervals, pair)
 
     def interval(carry):
         i, pair_bar, sums = carry
-        first = 1 + i * length
-        count = jnp.minimum(stages - first, length)
+        first = 1 + i * interval_length
+        count = jnp.minimum(stages - first, interval_length)
 
         def keep(m, carry):
             pair, kept = carry
             return forward.next(first + m + 1, pair), _put(kept, m, pair[0])
 
-        start = (_get(starts, i), _room(length, y0))
+        start = (_get(starts, i), _room(interval_length, y0))
         kept = jax.lax.fori_loop(0 * one, count, keep, start)[1]
 
         def back(m, carry):
@@ -202,17 +342,23 @@ def _last_reverse(residuals, cotangent, perturbed, inputs, rows, stages):
         return i - 1, pair_bar, sums
 
     zero = lambda tree: jax.tree.map(jnp.zeros_like, tree)
-    cotangent = jax.tree.map(
-        lambda c, y: jnp.zeros_like(y) if c is None else c,
-        cotangent, y0, is_leaf=lambda c: c is None,
-    )  # fmt: skip
-    carry = (intervals, (cotangent, zero(y0)), (zero(parameters), zero(y0), zero(k0)))
+    filled = lambda bar, like: jax.tree.map(
+        lambda b, y: jnp.zeros_like(y) if b is None else b, bar, like, is_leaf=lambda b: b is None
+    )
+    # The rate at the end is that of the last stage.
+    ending = lambda parameters, y: eqx.combine(parameters, fixed)[0](rows[stages, _NODE], y)
+    w_bar, y1_bar = jax.vjp(ending, parameters, y1)[1](filled(cotangent.rate, rate0))
+    y1_bar = added(filled(cotangent.y, y0), y1_bar)
+    carry = (intervals, (y1_bar, zero(y0)), (w_bar, zero(y0), zero(y0)))
     _, (y1_bar, start_bar), (w_bar, y0_bar, k0_bar) = jax.lax.while_loop(
         lambda carry: carry[0] >= 0, interval, carry
     )
     y0_bar = added(y0_bar, start_bar, y1_bar)
-    k0_bar = added(k0_bar, _scaled(rows[1, _MU_K], y1_bar))
-    return w_bar, eqx.filter(y0_bar, perturbed[1]), eqx.filter(k0_bar, perturbed[2])
+    k0_bar = added(k0_bar, _scaled(rows[1, _GAMMA_K], y1_bar))
+    start = lambda parameters, rate0: eqx.combine(parameters, fixed)[1](rate0)
+    w_part, rate0_bar = jax.vjp(start, parameters, rate0)[1](k0_bar)
+    w_bar = added(w_bar, w_part)
+    return w_bar, eqx.filter(y0_bar, perturbed[1]), eqx.filter(rate0_bar, perturbed[2])
 
 
 def _scaled(factor, y: PyTree[Array]) -> PyTree[Array]:

@@ -13,16 +13,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from ..arguments import real, whole
-from ..functions import constant, numbers_as_arrays
-from .chebyshev import Loop, last_stage
-from .states import dtype_of, length, small
+from ..functions import numbers_as_arrays
+from .chebyshev import End, Loop, Radius, Step
+from .states import dtype_of
 
 # Steps between two estimates of the spectral radius, applications in the first and in later ones.
 _REFRESH, _FIRST, _LATER = 25, 20, 4
 # The age of an estimate before there is one.
 _UNKNOWN = -1
-# A power iteration sees the radius from below.
-_SAFETY = 1.2
 
 
 class _State(NamedTuple):
@@ -127,34 +125,33 @@ class RKC2(dfx.AbstractAdaptiveSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         rate = after_jump(made_jump, solver_state.rate, lambda: terms.vf(t0, y0, args))
-        state = self._refreshed(terms, t0, y0, args, solver_state._replace(rate=rate))
+        state = solver_state._replace(rate=rate)
         span = terms.contr(t0, t1)
-        k0 = terms.prod(state.rate, span)
-        need = 1.54 * jax.lax.stop_gradient(jnp.abs(t1 - t0)) * state.radius
-        stages = 1 + jnp.floor(jnp.sqrt(1 + need))
-        enough = stages <= self.max_stages  # also False for a radius that is not finite
-        stages = jnp.where(enough, stages, 2).astype(jnp.int32)
-
-        def increment(fraction, y):
-            return terms.vf_prod(t0 + fraction * (t1 - t0), y, args, span)
-
-        y1 = last_stage(increment, y0, k0, stages, max_stages=self.max_stages, loop=self.loop)
-        rate = terms.vf(t1, y1, args)
-        k1 = terms.prod(rate, span)
+        weigh = lambda rate: terms.prod(rate, span)
+        step = Step(
+            lambda c, y: terms.vf(t0 + c * (t1 - t0), y, args), weigh, y0, rate, self.max_stages
+        )
+        end = step(t1 - t0, self._known(state), self.loop)
+        k0, k1 = weigh(rate), weigh(end.rate)
+        y1, enough = end.y, end.enough
         error = jax.tree.map(lambda a, b, p, q: 0.8 * (a - b) + 0.4 * (p + q), y0, y1, k0, k1)
         error = jax.tree.map(lambda e: jnp.where(enough, e, jnp.inf), error)
         result = dfx.RESULTS.where(enough, dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence)
         dense = dict(y0=y0, y1=y1, k0=k0, k1=k1)
-        return y1, error, dense, state._replace(rate=rate, age=state.age + 1), result
+        return y1, error, dense, self._later(state, end), result
 
-    def _refreshed(self, terms, t0, y0, args, state: _State) -> _State:
+    def _known(self, state: _State) -> Radius:
         if self.spectral_radius is not None:
-            return state
+            return Radius(state.radius)
         later = jnp.where(state.age < _REFRESH, 0, _LATER)
-        count = jnp.where(state.age == _UNKNOWN, _FIRST, later)
-        radius, direction = _power(terms, t0, y0, args, state.rate, state.direction, count)
-        new = state._replace(radius=radius, direction=direction, age=jnp.zeros_like(state.age))
-        return jax.tree.map(lambda new, old: jnp.where(count > 0, new, old), new, state)
+        turns = jnp.where(state.age == _UNKNOWN, _FIRST, later)
+        return Radius(state.radius, state.direction, turns)
+
+    def _later(self, state: _State, end: End) -> _State:
+        age = state.age
+        if self.spectral_radius is None:
+            age = jnp.where(jnp.asarray(end.radius.turns) > 0, 0, age)
+        return _State(end.rate, end.radius.value, end.radius.direction, age + 1)
 
 
 def after_jump(made_jump, rate: PyTree[Array], fresh: Callable[[], PyTree[Array]]):
@@ -162,27 +159,6 @@ def after_jump(made_jump, rate: PyTree[Array], fresh: Callable[[], PyTree[Array]
     if made_jump is False:  # known when the program is made
         return rate
     return jax.lax.cond(jnp.asarray(made_jump), fresh, lambda: rate)
-
-
-def _power(terms, t, y, args, rate, direction, count):
-    """Spectral radius of the Jacobian by power iterations on differences, and its direction.
-
-    One loop for any number of them, none included: the rate takes long to compile.
-    """
-    terms, y, args, rate, direction = constant((terms, y, args, rate, direction))
-    size = small(y)
-
-    def multiply(_, carry):
-        v, _ = carry
-        scale = size / length(v)
-        moved = terms.vf(t, jax.tree.map(lambda y, v: y + scale * v, y, v), args)
-        v = jax.tree.map(lambda a, b: (a - b) / size, moved, rate)
-        stretched = length(v)
-        return jax.tree.map(lambda v, d: jnp.where(stretched > 0, v, d), v, direction), stretched
-
-    start = direction, jnp.zeros_like(size)
-    v, radius = jax.lax.fori_loop(0, constant(count), multiply, start)
-    return constant((_SAFETY * radius, v))
 
 
 def _noise(y: Array) -> Array:

@@ -109,8 +109,9 @@ def integrate(
     Raises:
         TypeError: arguments of another kind; functions not made of operations of JAX; a state of
             another precision than its rate.
-        ValueError: a state that is not finite, or for which the right-hand side is not; explicit
-            steps beyond the limit of stability (with step, limit and spectral radius); diffusion
+        ValueError: a state that is not finite, or for which the right-hand side is not; steps of
+            given length that are explicit, in part or whole, beyond the limit of stability (with
+            step, limit and spectral radius; of a rate that depends on time at six times); diffusion
             backwards in time; a border about which nothing is said; tolerances out of range; a
             checkpoint that is of another run or damaged.
         IntegrationError: the end was not reached: the solution diverges (or grows a hundredfold
@@ -223,17 +224,22 @@ def _summary(plan: Plan, solution: dfx.Solution, t: float) -> str:
 
 
 def _unstable(name: str, run: Run, verdict: Verdict) -> str:
-    assert run.tableau is not None and run.dt0 is not None
-    dt, span = abs(float(run.dt0)), abs(float(run.t1 - run.t0))
-    limit, radius = verdict.longest(run.tableau, dt, span)
-    split = len(verdict.projected) > 1
+    assert run.amplification is not None and run.step is not None
+    dt, span = abs(float(run.step)), abs(float(run.t1 - run.t0))
+    limit, radius = verdict.longest(run.amplification, dt, span)
+    split, given = len(verdict.projected) > 1, run.dt0 is not None
+    step = f"dt0 = {dt:g}" if given else f"a step of {dt:g}"
+    when = "" if verdict.time == run.t0 else f" at t = {float(verdict.time):.3g}"
+    stable = f"is stable up to {limit:.3g}" if limit else "is stable for no step here"
     what = "explicit part of the right-hand side" if split else "right-hand side"
-    others = "" if split else ", or js.RKC2() or js.IMEX()"
+    better = "no dt0 (steps are then adapted)" if given else "a controller that adapts them"
+    better = f"shorter steps, or {better}" if limit else better
+    for other in () if split else ("RKC2", "IMEX"):
+        better += "" if other == name else f", or js.{other}()"
     return (
-        f"dt0 = {dt:g} is unstable: {name} is stable up to {limit:.3g}, the spectral radius of the "
-        f"{what} is {radius:.3g}; longer steps multiply its fastest mode by "
-        f"{float(jnp.exp(verdict.excess)):.3g} each. Shorter steps, or no dt0 (steps are then "
-        f"adapted){others}"
+        f"{step} is unstable{when}: {name} {stable}, the spectral radius of the {what} is "
+        f"{radius:.3g}; {'longer' if limit else 'these'} steps multiply its fastest mode by "
+        f"{float(jnp.exp(verdict.excess)):.3g} each. {better[0].upper()}{better[1:]}"
     )
 
 

@@ -42,23 +42,35 @@ class Rest(eqx.Module):
         return jax.tree.map(lambda f, k: f - k, self.whole(t, y, args), self.linear(t, y, args))
 
 
+def has_phases(terms: PyTree) -> bool:
+    """Whether what is frozen for a step changes from step to step."""
+    return any(map(_is_linear, jax.tree.leaves(terms, is_leaf=_is_linear)))
+
+
+def frozen(terms: dfx.MultiTerm, t, y: PyTree[Array]) -> dfx.MultiTerm:
+    """The terms with the linear part of this state, and what it leaves."""
+    rest, linear = terms.terms
+    # diffrax runs backwards with times of the other sign.
+    real = t * getattr(linear, "direction", 1)
+    now = jax.tree.map(lambda x: x.at(real, y) if _is_linear(x) else x, linear, is_leaf=_is_linear)
+    part = next(filter(_is_linear, jax.tree.leaves(now, is_leaf=_is_linear)))
+    is_rest = lambda x: isinstance(x, Rest)
+    left = lambda x: Rest(x.whole, part) if is_rest(x) else x
+    return dfx.MultiTerm(jax.tree.map(left, rest, is_leaf=is_rest), now)
+
+
 def frozen_at(terms: dfx.MultiTerm, t, y: PyTree[Array], rates: tuple) -> tuple:
     """The terms with a linear part that does not change in a step, and their rates at its start.
 
     Whatever the parts are, they add up to the same: so do their rates.
     """
-    is_linear = lambda x: isinstance(x, Linear)
-    linear = terms.terms[1]
-    if not any(map(is_linear, jax.tree.leaves(linear, is_leaf=is_linear))):
+    if not has_phases(terms.terms[1]):
         return terms, rates
-    # diffrax runs backwards with times of the other sign.
-    real = t * getattr(linear, "direction", 1)
-    now = jax.tree.map(lambda x: x.at(real, y) if is_linear(x) else x, linear, is_leaf=is_linear)
-    part = next(filter(is_linear, jax.tree.leaves(now, is_leaf=is_linear)))
-    is_rest = lambda x: isinstance(x, Rest)
-    rest = jax.tree.map(
-        lambda x: Rest(x.whole, part) if is_rest(x) else x, terms.terms[0], is_leaf=is_rest
-    )
-    rate = now.vf(t, y, None)
+    terms = frozen(terms, t, y)
+    rate = terms.terms[1].vf(t, y, None)
     left = jax.tree.map(lambda a, b, k: a + b - k, *rates, rate)
-    return dfx.MultiTerm(rest, now), (left, rate)
+    return terms, (left, rate)
+
+
+def _is_linear(x) -> bool:
+    return isinstance(x, Linear)

@@ -15,14 +15,15 @@ from jaxtyping import Array, PyTree
 
 from ..arguments import instance, real, whole, within_round_off
 from ..failures import is_concrete, is_marking, warn
-from ..functions import canonical, constant, numbers_as_arrays
+from ..functions import Traced, canonical, constant, numbers_as_arrays
+from .amplification import AbstractAmplification, amplification_of
 from .asked import check_coefficients, check_saves, checked_rate, checked_state, checked_times
 from .chebyshev import Loop
 from .explicit import RKC2
 from .guard import Guard, guarded
-from .phases import Linear, Rest
+from .phases import Linear, Rest, frozen, has_phases
 from .problem import AbstractEvolution, checked_problem
-from .stability import Additive, Tableau, Verdict, check_steps, tableau_of
+from .stability import Verdict, check_steps
 from .states import Norm, root_mean_square
 
 _log = logging.getLogger(__name__)
@@ -88,13 +89,31 @@ class Run(eqx.Module):
         return eqx.tree_at(lambda run: (run.u0, run.t0, run.t1, run.saveat), self, new)
 
     @property
-    def tableau(self) -> Tableau | Additive | None:
-        """Of the steps, if they are explicit, in part or whole, and of given length: these can be
-        unstable. (Where geometry is in the state, that the surface folds tells.)"""
+    def step(self) -> Array | None:
+        """The length of the steps if it is given: of the longest if they differ."""
+        if isinstance(self.controller, dfx.StepTo):
+            return jnp.max(jnp.abs(jnp.diff(self.controller.ts)))
         adaptive = isinstance(self.controller, dfx.AbstractAdaptiveStepSizeController)
-        is_linear = lambda x: isinstance(x, Linear)
-        moving = any(map(is_linear, jax.tree.leaves(self.terms, is_leaf=is_linear)))
-        return None if adaptive or self.dt0 is None or moving else tableau_of(self.solver)
+        return None if adaptive else self.dt0
+
+    @property
+    def amplification(self) -> AbstractAmplification | None:
+        """Of the steps, if they are explicit, in part or whole, and of given length: these can be
+        unstable."""
+        return None if self.step is None else amplification_of(self.solver)
+
+    def judged(self) -> Verdict | None:
+        """Whether they are; None if they cannot be."""
+        if self.amplification is None:
+            return None
+        terms = self.terms
+        changes = any(part.reads_first for part in _programs(terms))
+        if has_phases(terms):
+            terms = frozen(terms, self.t0, self.u0)
+        parts = terms.terms if isinstance(terms, dfx.MultiTerm) else (terms,)
+        rates = tuple(part.vf for part in parts)
+        now = (self.t0, self.u0, self.args, self.step, self.t1 - self.t0)
+        return check_steps(self.amplification, rates, *now, changes)
 
 
 class Plan(NamedTuple):
@@ -116,13 +135,8 @@ class Plan(NamedTuple):
 @eqx.filter_jit
 def solve(run: Run) -> tuple[dfx.Solution, Verdict | None]:
     """The integration, and whether its steps were stable; one program for all numbers."""
-    verdict, refused = None, jnp.asarray(False)
-    if run.tableau is not None:
-        span = run.t1 - run.t0
-        parts = run.terms.terms if isinstance(run.terms, dfx.MultiTerm) else (run.terms,)
-        rates = tuple(part.vf for part in parts)
-        verdict = check_steps(run.tableau, rates, run.t0, run.u0, run.args, run.dt0, span)
-        refused = ~verdict.stable
+    verdict = run.judged()
+    refused = jnp.asarray(False) if verdict is None else ~verdict.stable
     solution = dfx.diffeqsolve(
         run.terms,
         run.solver,
@@ -256,6 +270,11 @@ def _linear_part(problem: AbstractEvolution, now) -> Linear:
     shapes = jax.eval_shape(first, t, u)
     arrays = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
     return Linear(first, canonical(checked_rate(apply), t, u, arrays))
+
+
+def _programs(terms: PyTree) -> list[Traced]:
+    is_program = lambda x: isinstance(x, Traced)
+    return [x for x in jax.tree.leaves(terms, is_leaf=is_program) if is_program(x)]
 
 
 def _takes_two(solver: dfx.AbstractSolver) -> bool:

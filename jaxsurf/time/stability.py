@@ -4,16 +4,15 @@ A Runge–Kutta step makes $R(\Delta t\,\lambda)\,v$ of an eigenvector v of the 
 Jacobian J, where the equation makes $e^{\Delta t\,\lambda}\,v$ of it, with R the stability
 polynomial of the method. Here both are taken of the Hessenberg matrix H of a few Arnoldi steps,
 which has the outermost eigenvalues of J, and compared by their spectral radii. Of steps that are
-partly implicit that is the space of the explicit part, and R is of both projected parts.
+partly implicit that is done in the space of as many steps for each part, and R is of both projected
+parts. Where J depends on time, it is done at several times.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,75 +21,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from ..functions import constant
-from .implicit import IMEX
+from .amplification import AbstractAmplification, log_radius
 from .states import length, small
 
 # Arnoldi steps; a run is refused in which a mode is amplified so many times beyond what it should.
 _STEPS, _AMPLIFIED = 24, 2.0
-
-
-class Tableau(eqx.Module):
-    """The coefficients of an explicit Runge–Kutta method that its stability follows from.
-
-    Args:
-        rows: strictly lower, row by row.
-        weights: of the result.
-    """
-
-    rows: tuple[tuple[float, ...], ...] = eqx.field(static=True)
-    weights: tuple[float, ...] = eqx.field(static=True)
-
-    def amplification(self, parts: Sequence, one: Any) -> Any:
-        """R(z) of a matrix z, the only part; one is the identity."""
-        (z,) = parts
-        increments = [z]
-        for row in self.rows:
-            increments.append(z @ (one + sum(a * k for a, k in zip(row, increments))))
-        return one + sum(b * k for b, k in zip(self.weights, increments))
-
-
-class Additive(eqx.Module):
-    """The coefficients of a method that treats one part explicitly and one implicitly.
-
-    Args:
-        explicit, implicit: strictly lower, row by row from the second on.
-        gamma: of every implicit stage.
-        weights: of the result.
-    """
-
-    explicit: tuple[tuple[float, ...], ...] = eqx.field(static=True)
-    implicit: tuple[tuple[float, ...], ...] = eqx.field(static=True)
-    gamma: float = eqx.field(static=True)
-    weights: tuple[float, ...] = eqx.field(static=True)
-
-    def amplification(self, parts: Sequence, one: Any) -> Any:
-        """R of two matrices, explicit and implicit."""
-        first, second = parts
-        numbers = np if isinstance(one, np.ndarray) else jnp
-        increments = [(first, second)]
-        for rows in zip(self.explicit, self.implicit):
-            known = one + sum(
-                a * k for row, ks in zip(rows, zip(*increments)) for a, k in zip(row, ks)
-            )
-            y = numbers.linalg.solve(one - self.gamma * second, known)
-            increments.append((first @ y, second @ y))
-        return one + sum(b * (k + j) for b, (k, j) in zip(self.weights, increments))
-
-
-def tableau_of(solver: dfx.AbstractSolver) -> Tableau | Additive | None:
-    """That of an explicit Runge–Kutta method or of `IMEX`; None for another solver."""
-    if isinstance(solver, IMEX):
-        known = solver.tableau
-        lower = lambda m: tuple(tuple(map(float, row[:i])) for i, row in enumerate(m) if i)
-        explicit, implicit = lower(known.explicit), lower(known.implicit)
-        return Additive(explicit, implicit, known.gamma, tuple(map(float, known.weights)))
-    if isinstance(solver, dfx.Euler):
-        return Tableau((), (1.0,))
-    if isinstance(solver, dfx.AbstractERK):
-        tableau: Any = solver.tableau
-        rows = tuple(tuple(map(float, row)) for row in tableau.a_lower)
-        return Tableau(rows, tuple(map(float, tableau.b_sol)))
-    return None
+# Where a rate that depends on time is looked at: of no period in common.
+_PLACES = (0.0, 0.14, 0.33, 0.59, 0.83, 1.0)
 
 
 class Verdict(eqx.Module):
@@ -98,87 +35,119 @@ class Verdict(eqx.Module):
 
     Args:
         stable: False if a mode is amplified beyond what the equation makes of it.
-        projected: H, or that of each part, in units of 1 / time.
+        time: where it is amplified most.
+        projected: H there, or that of each part, in units of 1 / time.
         excess: logarithm of that amplification in one step.
     """
 
     stable: Array
+    time: Array
     projected: tuple[Float[Array, "m m"], ...]
     excess: Array
 
-    def longest(self, tableau: Tableau | Additive, dt: float, span: float) -> tuple[float, float]:
+    def longest(self, step: AbstractAmplification, dt: float, span: float) -> tuple[float, float]:
         """The longest stable step up to dt, and the spectral radius of the first part (host)."""
         parts = [np.asarray(part, float) for part in self.projected]
-        one, exact = np.eye(len(parts[0])), np.linalg.eigvals(sum(parts)).real.max()
-        radius = float(np.abs(np.linalg.eigvals(parts[0])).max())
-        for step in dt * np.geomspace(1, 1e-8, 1000):
+        exact = np.linalg.eigvals(sum(parts)).real.max()
+        radius = float(np.exp(log_radius(parts[0])))
+        for shorter in dt * np.geomspace(1, 1e-8, 1000):
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                found = tableau.amplification([step * part for part in parts], one)
+                found = step(shorter, [shorter * part for part in parts])
                 if not np.isfinite(found).all():
                     continue
-                growth = np.log(np.abs(np.linalg.eigvals(found)).max()) - max(step * exact, 0)
-            if growth * max(span / step, 1) <= np.log(_AMPLIFIED):
-                return float(step), radius
+                growth = log_radius(found) - max(shorter * exact, 0)
+            if growth * max(span / shorter, 1) <= np.log(_AMPLIFIED):
+                return float(shorter), radius
         return 0.0, radius
 
 
 def check_steps(
-    tableau: Tableau | Additive, rates: Sequence[Callable], t, u: PyTree[Array], args, dt, span
+    step: AbstractAmplification,
+    rates: Sequence[Callable],
+    t0,
+    u: PyTree[Array],
+    args,
+    dt,
+    span,
+    changes: bool,
 ) -> Verdict:
     """Compare what steps of length dt over a span of time do with what they should.
 
     Args:
-        tableau: of the method.
+        step: of the method.
         rates: (t, u, args) -> right-hand side, or its explicit and its implicit part.
-        t, u, args: where they are linearised.
-        dt, span: lengths in time.
+        t0, u, args: where they are linearised.
+        dt, span: in time, of either sign.
+        changes: whether a rate depends on time.
     """
-    parts = projected(rates, t, u, args)
-    h = functools.reduce(jnp.add, parts)
-    dt, span = constant((jnp.abs(dt), jnp.abs(span)))
-    one = jnp.eye(len(h), dtype=h.dtype)
-    z = dt * h
-    size = jnp.maximum(jnp.max(jnp.sum(jnp.abs(z), axis=1)), 1)
-    grown = jnp.maximum(size * _log_radius(_exponential(z / size)), 0)
-    excess = _log_radius(tableau.amplification([dt * part for part in parts], one)) - grown
-    steps = jnp.maximum(span / dt, 1)
-    # What is not finite is for others to find.
-    round_off = 50 * jnp.finfo(h.dtype).eps * size
-    unstable = steps * (excess - round_off) > np.log(_AMPLIFIED)
-    return Verdict(~unstable, parts, excess)
+    step, rates, t0, u, args, dt, span = constant((step, rates, t0, u, args, dt, span))
+    dt, length = jnp.abs(dt), jnp.abs(span)
+
+    def at(t):
+        parts = tuple(jnp.sign(span) * part for part in projected(rates, t, u, args))
+        h = functools.reduce(jnp.add, parts)
+        z = dt * h
+        size = jnp.maximum(jnp.max(jnp.sum(jnp.abs(z), axis=1)), 1)
+        grown = jnp.maximum(size * log_radius(_exponential(z / size)), 0)
+        excess = log_radius(step(dt, [dt * part for part in parts])) - grown
+        round_off = 50 * jnp.finfo(h.dtype).eps * size
+        # What is not finite is for others to find.
+        unstable = jnp.maximum(length / dt, 1) * (excess - round_off) > np.log(_AMPLIFIED)
+        return Verdict(~unstable, t, parts, excess)
+
+    if not changes:
+        return at(t0)
+
+    def worse(worst, t):
+        found = at(t)
+        replace = found.excess > worst.excess
+        return jax.tree.map(lambda new, old: jnp.where(replace, new, old), found, worst), None
+
+    none = jnp.zeros((_rank(u, len(rates)),) * 2, t0.dtype)
+    fine = Verdict(jnp.asarray(True), t0, (none,) * len(rates), jnp.full_like(t0, -jnp.inf))
+    return jax.lax.scan(worse, fine, t0 + span * jnp.asarray(_PLACES, t0.dtype))[0]
+
+
+def _rank(u: PyTree[Array], count: int) -> int:
+    """Of the space for so many parts."""
+    return min(_STEPS * count, sum(leaf.size for leaf in jax.tree.leaves(u)))
 
 
 def projected(
     rates: Sequence[Callable], t, u: PyTree[Array], args
 ) -> tuple[Float[Array, "m m"], ...]:
-    """The Jacobians of right-hand sides on the Krylov space of the first, of a random state."""
-    rates, t, u, args = constant((rates, t, u, args))
+    """The Jacobians of right-hand sides on the sum of their Krylov spaces, of random states."""
     base, unravel = ravel_pytree(u)
-    size = small(base)
-    of = lambda rate, v: ravel_pytree(rate(t, unravel(v), args))[0]
-    values = [of(rate, base) for rate in rates]
+    size, count = small(base), len(rates)
+    steps = _rank(u, count)
+    # Row 0 is no direction: there the rates themselves are computed, by the same program. Then come
+    # random starts, which are left out of the space: what no part stretches (the points of a
+    # surface, beside fields whose rate hangs on them much) would hide the outermost eigenvalues.
+    random = np.random.default_rng(0).normal(size=(count, base.size)) / base.size**0.5
+    space = jnp.zeros((1 + count + steps, base.size), base.dtype)
+    space = space.at[1 : 1 + count].set(jnp.asarray(random, base.dtype))
+    left_out = jnp.arange(len(space))[:, None] <= count
 
-    def along(v):  # by differences: a right-hand side may have a rule for the reverse mode only
-        near = base + size * v
-        return jnp.stack([(of(f, near) - value) / size for f, value in zip(rates, values)])
-
-    steps = min(_STEPS, base.size)
-    start = jnp.asarray(np.random.default_rng(0).normal(size=base.size), base.dtype)
-    space = jnp.zeros((steps + 1, base.size), base.dtype).at[0].set(start / length(start))
-
-    def extend(space, j):
-        images = along(space[j])
-        image = v = images[0]
+    def extend(carry, j):
+        space, values = carry
+        state = unravel(base + size * space[j])
+        found = jnp.stack([ravel_pytree(rate(t, state, args))[0] for rate in rates])
+        values = jnp.where(j > 0, values, found)
+        # By differences: a right-hand side may have a rule for the reverse mode only.
+        images = (found - values) / size
+        image = v = images[(j - 1) % count]
+        basis = jnp.where(left_out, 0, space)
         for _ in range(2):
-            v = v - space.T @ (space @ v)
+            v = v - basis.T @ (basis @ v)
         # Where only round-off is left, the space is complete: no further directions.
         left = length(v)
-        fresh = left > 10 * jnp.sqrt(jnp.finfo(v.dtype).eps) * length(image)
+        fresh = (left > 10 * jnp.sqrt(jnp.finfo(v.dtype).eps) * length(image)) & (j > 0)
         v = jnp.where(fresh, v / jnp.where(fresh, left, 1), 0)
-        return space.at[j + 1].set(v), images
+        return (space.at[j + count].add(v, mode="drop"), values), images
 
-    space, images = jax.lax.scan(extend, space, jnp.arange(steps))
-    return tuple(space[:steps] @ images[:, i].T for i in range(len(rates)))
+    none = jnp.zeros((count, base.size), base.dtype)
+    (space, _), images = jax.lax.scan(extend, (space, none), jnp.arange(len(space)))
+    return tuple(space[1 + count :] @ images[1 + count :, i].T for i in range(count))
 
 
 def _exponential(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
@@ -186,19 +155,3 @@ def _exponential(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
     one = jnp.eye(len(matrix), dtype=matrix.dtype)
     further = lambda total, k: (one + matrix @ total / k, None)
     return jax.lax.scan(further, one, jnp.arange(18.0, 0.0, -1.0, dtype=matrix.dtype))[0]
-
-
-def _log_radius(matrix: Float[Array, "m m"]) -> Array:
-    """Logarithm of the spectral radius, by squaring over and over."""
-    count = 30
-
-    def square(carry, _):
-        matrix, total, power = carry
-        norm = jnp.sqrt(jnp.sum(matrix * matrix))
-        norm = jnp.where(norm > 0, norm, 1)
-        matrix = matrix / norm
-        return (matrix @ matrix, total + jnp.log(norm) * power, power / 2), None
-
-    start = (matrix, jnp.zeros((), matrix.dtype), jnp.ones((), matrix.dtype))
-    (_, total, _), _ = jax.lax.scan(square, start, length=count)
-    return total

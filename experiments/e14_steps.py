@@ -26,9 +26,9 @@ _PAPER = {100: 5.45e-2, 200: 2.74e-2, 400: 1.38e-2, 800: 6.99e-3, 1600: 3.56e-3}
 
 
 @eqx.filter_jit
-def first_order(surface: js.Discretization, steps: int):
-    """Points and field at t = 1."""
-    dt = 1 / steps
+def first_order(surface: js.Discretization, steps: int, end: float = 1.0):
+    """Points and field at the end."""
+    dt = end / steps
     start = surface.cloud.points
 
     def step(state, t):

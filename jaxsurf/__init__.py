@@ -71,6 +71,7 @@ from .moving.flows import SurfaceDiffusionFlow as SurfaceDiffusionFlow
 from .moving.flows import WillmoreFlow as WillmoreFlow
 from .moving.motions import AbstractMotion as AbstractMotion
 from .moving.motions import Motion as Motion
+from .moving.redistribution import Redistribution as Redistribution
 from .neighbors import Neighbors as Neighbors
 from .neighbors import find_neighbors as find_neighbors
 from .normals import estimate_normals as estimate_normals

@@ -579,7 +579,7 @@ BESIDE = {
     "AbstractOperator": "Stencil", "AbstractMethod": "laplace_beltrami",
     "AbstractPreconditioner": "jacobi", "AbstractEvolution": "integrate",
     "Motion": "evolve", "AbstractMotion": "evolve", "MeanCurvatureFlow": "evolve",
-    "SurfaceDiffusionFlow": "evolve", "WillmoreFlow": "evolve",
+    "SurfaceDiffusionFlow": "evolve", "WillmoreFlow": "evolve", "Redistribution": "evolve",
     "Evolution": "evolve", "Adaptation": "adapt_points", "Adapted": "adapt_points",
     "Contact": "evolve",
     "moments": "volume", "compliance": "volume", "chamfer_distance": "volume",

@@ -20,14 +20,13 @@ from ..discretization import Discretization, discretize
 from ..functions import canonical
 from ..motion import stretch, unreached
 from ..neighbors import Neighbors
-from ..normals import refit_normals
 from ..renew import NeighborSearch
 from ..time.checkpoint import Checkpoint, digest, read_back, written
 from ..time.integrate import IntegrationError, integrate
 from ..time.run import planned
 from .adaptation import Adaptation, changed, conserved
 from .contact import Contact, watched
-from .problem import Moving, joined, parted
+from .problem import Moving, fitted_normals, joined, parted
 from .surgery import rejoined
 
 # Points are added and merged where neighbourhoods have grown or shrunk by this factor, and a step
@@ -271,8 +270,7 @@ class _Run:
     def renew(self) -> None:
         """Normals and neighbours found anew, and points changed."""
         surface, cloud = self.moving.surface, self.moving.cloud_at(self.state[0])
-        degree = surface.method.polynomial_degree
-        normals = refit_normals(cloud.points, cloud.normals, surface.neighbors, degree=degree)
+        normals = fitted_normals(surface, cloud.points, cloud.normals)
         cloud = eqx.tree_at(lambda c: c.normals, cloud, normals)
         if self.search is None:
             self.search = self.room(surface)

@@ -44,7 +44,16 @@ class AbstractMotion(eqx.Module):
 
     @abc.abstractmethod
     def velocity(self, t, surface: Discretization, fields: PyTree[Array], args) -> Array:
-        """The velocity of the points `(n, d)`, in length / time."""
+        """The velocity of the surface and what is on it, `(n, d)`, in length / time."""
+
+    @property
+    def slides(self) -> bool:
+        """Whether points move along the surface beside that, as `sliding` says."""
+        return False
+
+    def sliding(self, t, surface: Discretization, fields: PyTree[Array], args) -> Array:
+        """How they do, `(n, d)`, while fields stay where they are."""
+        raise NotImplementedError
 
     def __add__(self, other: AbstractMotion) -> AbstractMotion:
         return MotionSum(self._parts + other._parts) if _is_motion(other) else NotImplemented
@@ -112,6 +121,15 @@ class MotionSum(AbstractMotion):
 
     def velocity(self, t, surface, fields, args):
         each = [factor * m.velocity(t, surface, fields, args) for factor, m in self.parts]
+        return sum(each[1:], each[0])
+
+    @property
+    def slides(self):
+        return any(motion.slides for _, motion in self.parts)
+
+    def sliding(self, t, surface, fields, args):
+        parts = [(factor, motion) for factor, motion in self.parts if motion.slides]
+        each = [factor * motion.sliding(t, surface, fields, args) for factor, motion in parts]
         return sum(each[1:], each[0])
 
     def __repr__(self):

@@ -8,7 +8,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ..arguments import as_float, switched_off
 from ..cloud import PointCloud
@@ -16,6 +16,7 @@ from ..discretization import Discretization
 from ..failures import marking
 from ..functions import numbers_as_arrays
 from ..motion import carried, moved_cloud
+from ..normals import refit_normals
 from ..stencils.stencil import Stencil
 from ..time.explicit import RKC2
 from ..time.implicit import IMEX
@@ -33,6 +34,7 @@ class Moving(AbstractEvolution):
         motion: v.
         on: makes the problem of the fields from a surface; None: fields go with the points.
         faced: what points are kept apart from.
+        beside: what normals were there beside those of local fits, if the motion slides.
         pull: the stiff part of v on the surface of a state, see `at`.
         problem: that of the fields there.
     """
@@ -43,6 +45,7 @@ class Moving(AbstractEvolution):
     motion: AbstractMotion
     on: Callable | None
     faced: Faced | None = None
+    beside: Float[Array, "n d"] | None = None
     pull: Callable[[Array], Array] | None = None
     problem: AbstractEvolution | None = None
 
@@ -54,7 +57,10 @@ class Moving(AbstractEvolution):
         on: Callable | None,
         faced: Faced | None = None,
     ) -> Moving:
-        return cls(None, surface, surface.gradient, motion, on, faced)
+        points, normals = surface.cloud.points, surface.cloud.normals
+        fitted = lambda: normals - fitted_normals(surface, points, normals)
+        beside = fitted() if motion.slides else None
+        return cls(None, surface, surface.gradient, motion, on, faced, beside)
 
     def surface_at(self, points: Array) -> Discretization:
         """The surface with its points elsewhere."""
@@ -67,6 +73,10 @@ class Moving(AbstractEvolution):
     def _normals(self, points: Array) -> Array:
         before = self.surface.cloud
         normals = carried(self.gradient, before.normals, before.points, points)[0]
+        if self.beside is not None:
+            # Each point its own way, by up to a spacing: that is not smooth, the surface is.
+            normals = fitted_normals(self.surface, points, normals) + self.beside
+            normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
         return switched_off(self.active, normals, before.normals)
 
     @property
@@ -100,11 +110,15 @@ class Moving(AbstractEvolution):
         velocity = as_float(velocity, name, points.shape).astype(points.dtype)
         if self.faced is not None:
             velocity = self.faced.kept_apart(points, surface.cloud.normals, velocity)
-        if problem is None:
-            return self._free(joined(velocity, jax.tree.map(jnp.zeros_like, fields)))
-        dilution = problem.dilution(fields, surface.divergence(velocity))
-        change = problem.rate(t, fields, args)
-        return self._free(joined(velocity, jax.tree.map(jnp.add, change, dilution)))
+        changes = [jax.tree.map(jnp.zeros_like, fields)]
+        if problem is not None:
+            dilution = problem.dilution(fields, surface.divergence(velocity))
+            changes += [problem.rate(t, fields, args), dilution]
+        if self.motion.slides:
+            slide = self.motion.sliding(t, surface, fields, args)
+            passed = lambda u: jnp.einsum("nx,n...x->n...", slide, surface.gradient(u))
+            changes, velocity = [*changes, jax.tree.map(passed, fields)], velocity + slide
+        return self._free(joined(velocity, jax.tree.map(lambda *each: sum(each), *changes)))
 
     def at(self, t, u):
         surface = self.surface_at(u[0])
@@ -130,6 +144,12 @@ class Moving(AbstractEvolution):
         """With their bound values filled in."""
         points, fields = parted(u)
         return fields if self.on is None else self.on(self.surface_at(points)).closed(t, fields)
+
+
+def fitted_normals(surface: Discretization, points: Array, normals: Array) -> Array:
+    """Normals of the operators' order of a surface through points that are elsewhere."""
+    degree = surface.method.polynomial_degree
+    return refit_normals(points, normals, surface.neighbors, degree=degree)
 
 
 def joined(points: Array, fields: PyTree[Array]) -> tuple:

@@ -19,6 +19,8 @@ _FILLED = (
 )
 _F = "test_flows.py::"
 _C = "test_contact.py::"
+_S = "test_redistribution.py::"
+_SLID = _S + "test_derivatives_and_single_precision"
 _MET = (
     f"{_C}test_what_faces_what, {_C}test_a_cut_leaves_closed_surfaces, "
     f"{_C}test_plane_curves_pinch_too, {_C}test_a_waist_that_is_squeezed_pinches_off, "
@@ -105,6 +107,16 @@ TESTED: dict[str, dict[str, Entry]] = {
         "jit": f"{_F}test_derivatives_through_a_flow",
         "vmap": "(made of operators, as the velocities of Motion are)",
         "float32": f"{_F}test_in_single_precision",
+        "bad input": "malformed",
+    },
+    "Redistribution": {
+        "value": f"{_S}test_density_diffuses_and_all_else_stays, "
+        f"{_S}test_heat_is_as_on_points_at_rest, {_S}test_curves_and_spacings_that_vary, "
+        f"{_S}test_a_flow_with_it_has_the_same_surface_even_points_and_fewer_steps",
+        "gradient": {"diffusivity": _SLID, "points": _SLID, "fields": _SLID},
+        "jit": _SLID,
+        "vmap": _SLID,
+        "float32": _SLID,
         "bad input": "malformed",
     },
 }  # fmt: skip

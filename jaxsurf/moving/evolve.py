@@ -2,6 +2,7 @@ r"""One call from a motion and a surface to where it is later, with fields on it
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -162,7 +163,11 @@ def evolve(
     Accuracy: in time that of the solver; in space that of the method; in float32 points are within
         1e-5 (`tests/test_moving.py`).
     Differentiable: forward and reverse, under `jit`, with the neighbours that there were at t0,
-        which must then serve until t1.
+        which must then serve until t1. For longer, in parts: from `surface.moved(points, normals,
+        search=search)`, with neighbours found anew. What the host decides, by `adapt` and
+        `contact`, has no derivative; across points that were added it is that of a surface whose
+        new points are carried by those around them, `surface.interpolate`
+        (`tests/test_moving_gradients.py`). It is not defined across a cut.
     Raises:
         TypeError: arguments of other kinds.
         ValueError: wrong shapes; times that are not in order; on concrete arrays a surface that
@@ -284,14 +289,14 @@ def _kept(moving: Moving, state, t, times, options) -> Evolution:
         if target is not t:
             found = integrate(moving, state, t0=t, t1=target, **options)
             t, state = target, jax.tree.map(lambda y: y[-1], found.ys)
-        points, fields = parted(state)
-        code = moving.surface_at(points).code
+        code = moving.surface_at(parted(state)[0]).code
         text = "the surface does not keep the neighbours it had at t0: " + "; ".join(
             f"{number}: {text}" for number, text in CODES.items()
         )
-        points = refuse(points, jnp.any(code > 0), text)
-        fields = moving.fields(target, joined(points, fields))
-        rows.append((moving.surface_at(points), fields))
+        # Whatever is looked at of it, fields alone or points.
+        kept = functools.partial(refuse, bad=jnp.any(code > 0), message=text)
+        state = jax.tree.map(kept, state)
+        rows.append((moving.surface_at(parted(state)[0]), moving.fields(target, state)))
     return Evolution(jnp.stack([jnp.asarray(s) for s in times]), rows, {})
 
 

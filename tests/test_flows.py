@@ -65,6 +65,22 @@ def test_curves():
     np.testing.assert_allclose(radii, 1.3**0.5, rtol=1e-3)
 
 
+def test_curvature_smoothed():
+    r"""Of a mode of the sphere by $e^{-\lambda h^2 / 4}$; its mean curvature not at all."""
+    h, bump = 0.15, 1e-3
+    surface = js.discretize(bumpy(1_000, bump, 4), method=METHOD)
+    outward = lambda flow: jnp.sum(
+        flow.velocity(0.0, surface, (), None) * surface.cloud.normals, axis=1
+    )
+    modes = jnp.stack([jnp.ones(surface.n), legendre(surface.cloud.points)], axis=1)
+    fitted = lambda flow: np.asarray(jnp.linalg.lstsq(modes, outward(flow))[0])
+    plain, smooth = fitted(js.MeanCurvatureFlow()), fitted(js.MeanCurvatureFlow(smoothing=h))
+    assert abs(smooth[0] / plain[0] - 1) < 1e-4
+    assert abs(smooth[1] / plain[1] / np.exp(-6 * h**2 / 4) - 1) < 2e-3
+    kept = fitted(js.MeanCurvatureFlow(keep_volume=True, smoothing=h))
+    assert abs(kept[0]) < 1e-4 and abs(kept[1] / smooth[1] - 1) < 1e-3
+
+
 def on_tori(ratio, willmore):
     """The velocity at an angle, of a torus with the radii `ratio` and 1."""
     around = lambda a: ratio + jnp.cos(a)
@@ -127,7 +143,9 @@ def test_motions_are_added_and_multiplied():
     grow = js.Motion(lambda t, s, u, b: b * u[:, None] * s.cloud.normals)
     motion = 0.25 * (2 * js.MeanCurvatureFlow() + grow) + grow
     assert motion.derivatives == 2 and (grow * 2 + grow).derivatives == 0
-    assert repr(motion).startswith("0.5 * MeanCurvatureFlow(keep_volume=False) + 0.25 * Motion(")
+    assert repr(motion).startswith(
+        "0.5 * MeanCurvatureFlow(keep_volume=False, smoothing=None) + 0.25"
+    )
     cloud = js.circle(80)
     heat = lambda surface: js.AdvectionDiffusionReaction(surface.laplacian)
     given = dict(problem=heat, method=METHOD, args=1.2, rtol=1e-6, t1=0.4)

@@ -85,6 +85,8 @@ CALLS = [
     ("MeanCurvatureFlow", "text", lambda: js.MeanCurvatureFlow(keep_volume="yes"), ("keep_volume", "yes")),
     ("MeanCurvatureFlow", "a number", lambda: js.MeanCurvatureFlow(keep_volume=1.0), ("keep_volume", "1.0")),
     ("MeanCurvatureFlow", "a cloud", lambda: js.MeanCurvatureFlow(surface().cloud), ("keep_volume", "PointCloud")),
+    ("MeanCurvatureFlow", "smoothed over nothing", lambda: js.MeanCurvatureFlow(smoothing=0.0), ("smoothing", "0", "above 0")),
+    ("MeanCurvatureFlow", "smoothing as text", lambda: js.MeanCurvatureFlow(smoothing="wide"), ("smoothing", "wide")),
     ("SurfaceDiffusionFlow", "times text", lambda: "2" * js.SurfaceDiffusionFlow(), ("factor", "'2'")),
     ("SurfaceDiffusionFlow", "backwards", lambda: -1 * js.SurfaceDiffusionFlow(), ("factor", "-1", "above 0")),
     ("SurfaceDiffusionFlow", "on a surface with a border", lambda: js.evolve(js.SurfaceDiffusionFlow(), bordered(), t1=0.01), ("border",)),

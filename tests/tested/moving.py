@@ -84,7 +84,8 @@ TESTED: dict[str, dict[str, Entry]] = {
         "bad input": "malformed",
     },
     "MeanCurvatureFlow": {
-        "value": f"{_SHRUNK}, {_M}test_an_ellipsoid_that_keeps_its_volume_loses_area",
+        "value": f"{_SHRUNK}, {_M}test_an_ellipsoid_that_keeps_its_volume_loses_area, "
+        f"{_F}test_curvature_smoothed",
         "gradient": "(made of operators, whose derivatives are tested)",
         "jit": "(made of operators, as the velocities of Motion are)",
         "vmap": "(made of operators, as the velocities of Motion are)",

@@ -62,6 +62,19 @@ def add(a, b):
     return [x + y for x, y in zip(a, b)] if isinstance(a, list) else a + b
 
 
+def stored(x, w):
+    """The same array, which the compiler then stores: else it finds it again for every use.
+
+    It looks through barriers and takes nothing out of a branch.
+
+    Args:
+        w: weights, none of them negative, which the compiler does not know.
+    """
+    if namespace(x) is np or x.ndim < 3 or is_quick():
+        return x
+    return jax.lax.cond(~(w[0, 0] < 0), lambda x: x, jnp.zeros_like, x)
+
+
 def factor(gram):
     """A solver for the equilibrated symmetric matrix, and its condition estimate.
 

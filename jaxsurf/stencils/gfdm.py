@@ -62,7 +62,7 @@ class GFDM(AbstractMethod):
     def basis_size(self, dim, target):
         return needed_polynomials(self.degree, dim, target)
 
-    batch_size = 256
+    batch_size = 100
     polynomial_degree = property(lambda self: max(self.degree, 2))
     shares_moments = True
 

@@ -99,6 +99,7 @@ def _moment_solve_jvp(low, high, primals, tangents):
     x, w, b = primals
     dx, dw, db = tangents
     (eta, condition, residual), (v, start, solve, a, s) = _solve(x, w, b, low, high)
+    dx = _columns(dx, w)
     s = systems.stored(s, w)
     g = systems.stored(dw * s + w * moved(a, v, dx, start, high), w)
     rhs = add_moved_moments(systems.moments(v[start:], g), eta, v, dx, start, high)
@@ -153,12 +154,20 @@ def _polynomial_fit_jvp(low, high, primals, tangents):
     x, w, values = primals
     dx, dw, dz = tangents
     (out, condition), (v, start, solve) = _fit(x, w, values, low, high)
+    dx = _columns(dx, w)
     a = list(out) if isinstance(v, list) else out
     left = systems.stored(values - systems.combine(a, v[start:]), w)
     g = systems.stored(dw * left + w * (dz - moved(a, v, dx, start, high)), w)
     da = solve(add_moved_moments(systems.moments(v[start:], g), w * left, v, dx, start, high))
     da = jnp.stack(da) if isinstance(v, list) else da
     return (out, condition), (da, jnp.zeros_like(condition))
+
+
+def _columns(dx, w):
+    """The coordinates one by one: as slices each would have a derivative as large as all of them."""
+    if namespace(dx) is np or dx.ndim < 3:
+        return list(dx)
+    return [systems.stored(part[0], w) for part in jax.lax.split(dx, (1,) * len(dx))]
 
 
 def moved(a, v, dx, start, high):

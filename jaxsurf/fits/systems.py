@@ -62,15 +62,13 @@ def add(a, b):
     return [x + y for x, y in zip(a, b)] if isinstance(a, list) else a + b
 
 
-def stored(x, w):
-    """The same array, which the compiler then stores: else it finds it again for every use.
+def stored(x, v, w):
+    """The same array, which the compiler then stores, as it takes nothing out of a branch.
 
-    It looks through barriers and takes nothing out of a branch.
-
-    Args:
-        w: weights, none of them negative, which the compiler does not know.
+    Else it finds it again for every use: a sum for each monomial of v, say. It looks through
+    barriers, and does not know that no weight w is negative.
     """
-    if namespace(x) is np or w.ndim < 2 or is_quick():
+    if not isinstance(v, list):
         return x
     return jax.lax.cond(~(w[0, 0] < 0), lambda x: x, jnp.zeros_like, x)
 

@@ -30,7 +30,8 @@ from .fits.polygon import Sides, moments_over, ways_of
 from .neighbors import Neighbors
 from .stencils.method import AbstractMethod, with_center
 
-_BATCH = 128
+# No power of two, see `GFDM.batch_size`.
+_BATCH = 100
 # So many neighbours may bound a cell; where points are very uneven, all are tried.
 _CELLS = 24
 

@@ -8,7 +8,13 @@ import pytest
 
 from jaxsurf.fits.kernels import gaussian, support, taper
 from jaxsurf.fits.lines import are_steep, line_solve
-from jaxsurf.fits.moments import blockwise, in_blocks, moment_solve, out_of_blocks
+from jaxsurf.fits.moments import (
+    blockwise,
+    in_blocks,
+    moment_solve,
+    out_of_blocks,
+    polynomial_fit,
+)
 from jaxsurf.fits.monomials import differentiation, monomials, multi_indices
 from jaxsurf.stencils.targets import Gradient, Hessian, Laplacian, Partial
 
@@ -185,3 +191,18 @@ def test_lines_have_the_weights_of_their_points(dim, flat):
     for a, c in ((have, want), (d_have, d_want)):
         assert float(jnp.max(jnp.abs(a - c))) < slack * float(jnp.max(jnp.abs(c)))
     assert not have[:, -3:].any()
+
+
+def test_what_a_fit_leaves_is_computed_once():
+    """Not once for each monomial: 450 operations for each neighbour, not 850."""
+    rng = np.random.default_rng(0)
+    x, w, z = (jnp.asarray(rng.uniform(size=s)) for s in ((2, 30, 50), (30, 50), (1, 30, 50)))
+    program = jax.jit(lambda *a: polynomial_fit(*a, 1, 4)).lower(x, w, z).compile()
+    assert program.cost_analysis()["flops"] < 600 * w.size
+
+
+def test_a_weight_that_is_no_number_spoils_a_fit():
+    x = jnp.asarray(np.random.default_rng(0).uniform(size=(2, 30, 4)))
+    w = jnp.ones((30, 4)).at[0, 0].set(jnp.nan)
+    fitted = jax.jit(lambda *a: polynomial_fit(*a, 1, 2)[0])(x, w, x[:1])
+    assert np.isnan(fitted[..., 0]).all() and np.isfinite(fitted[..., 1:]).all()

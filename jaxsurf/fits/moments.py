@@ -99,11 +99,13 @@ def _moment_solve_jvp(low, high, primals, tangents):
     x, w, b = primals
     dx, dw, db = tangents
     (eta, condition, residual), (v, start, solve, a, s) = _solve(x, w, b, low, high)
-    g = dw * s + w * moved(a, v, dx, start, high)
+    dx = _columns(dx, v, w)
+    s = systems.stored(s, v, w)
+    g = systems.stored(dw * s + w * moved(a, v, dx, start, high), v, w)
     rhs = add_moved_moments(systems.moments(v[start:], g), eta, v, dx, start, high)
     if b.ndim > 2:
         rhs = systems.add(rhs, [-row for row in db] if isinstance(rhs, list) else -db)
-    d_eta = g - w * systems.combine(solve(rhs), v[start:])
+    d_eta = systems.stored(g - w * systems.combine(solve(rhs), v[start:]), v, w)
     return (eta, condition, residual), (d_eta, jnp.zeros_like(condition), jnp.zeros_like(residual))
 
 
@@ -141,8 +143,8 @@ def _fit(x, w, values, low, high):
     basis = v[start:]
     a = solve(systems.moments(basis, w * values), refined=False)
     # Refined by the residual: squaring the condition number costs digits, many in float32.
-    left = values - systems.combine(a, basis)
-    a = systems.add(a, solve(systems.moments(basis, w * left), refined=False))
+    left = systems.stored(w * (values - systems.combine(a, basis)), v, w)
+    a = systems.add(a, solve(systems.moments(basis, left), refined=False))
     return (jnp.stack(a) if isinstance(a, list) else a, condition), (v, start, solve)
 
 
@@ -152,12 +154,20 @@ def _polynomial_fit_jvp(low, high, primals, tangents):
     x, w, values = primals
     dx, dw, dz = tangents
     (out, condition), (v, start, solve) = _fit(x, w, values, low, high)
+    dx = _columns(dx, v, w)
     a = list(out) if isinstance(v, list) else out
-    left = values - systems.combine(a, v[start:])
-    g = dw * left + w * (dz - moved(a, v, dx, start, high))
+    left = systems.stored(values - systems.combine(a, v[start:]), v, w)
+    g = systems.stored(dw * left + w * (dz - moved(a, v, dx, start, high)), v, w)
     da = solve(add_moved_moments(systems.moments(v[start:], g), w * left, v, dx, start, high))
     da = jnp.stack(da) if isinstance(v, list) else da
     return (out, condition), (da, jnp.zeros_like(condition))
+
+
+def _columns(dx, v, w):
+    """Coordinates one by one: as slices each would have a derivative as large as all of them."""
+    if not isinstance(v, list):
+        return dx
+    return [systems.stored(part[0], v, w) for part in jax.lax.split(dx, (1,) * len(dx))]
 
 
 def moved(a, v, dx, start, high):

@@ -62,6 +62,17 @@ def add(a, b):
     return [x + y for x, y in zip(a, b)] if isinstance(a, list) else a + b
 
 
+def stored(x, v, w):
+    """The same array, which the compiler then stores, as it takes nothing out of a branch.
+
+    Else it finds it again for every use: a sum for each monomial of v, say. It looks through
+    barriers, and does not know that no weight w is negative.
+    """
+    if not isinstance(v, list):
+        return x
+    return jax.lax.cond(~(w[0, 0] < 0), lambda x: x, jnp.zeros_like, x)
+
+
 def factor(gram):
     """A solver for the equilibrated symmetric matrix, and its condition estimate.
 

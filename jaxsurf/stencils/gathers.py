@@ -106,13 +106,19 @@ def _sum_slots_jvp(contracted, primals, tangents):
     weights, indices, values = primals
     d_weights, _, d_values = tangents
     out = sum_slots(weights, indices, values, contracted)
-    pairs = [(d_weights, values), (weights, d_values)]
-    parts = [
-        _scan_slots(w, indices, u, contracted)
-        for w, u in pairs
-        if not any(isinstance(a, SymbolicZero) for a in (w, u))
-    ]
+    parts = []
+    if not isinstance(d_weights, SymbolicZero):
+        # For a single field all slots at once: transposed that is one product for each weight.
+        single = values.ndim == 1 and weights.ndim == 2
+        add = _all_slots if single else _scan_slots
+        parts.append(add(d_weights, indices, values, contracted))
+    if not isinstance(d_values, SymbolicZero):
+        parts.append(_scan_slots(weights, indices, d_values, contracted))
     return out, sum(parts, jnp.zeros_like(out))
+
+
+def _all_slots(weights, indices, values, contracted: int):
+    return jnp.sum(weights * take(values, indices), axis=0)
 
 
 def constant_product(weights, indices, x):

@@ -226,7 +226,7 @@ def _sought(surface: Discretization, rows: Rows, adaptation: Adaptation) -> _Sou
     feet, normals, wide = np.zeros((0, cloud.dim)), np.zeros((0, cloud.dim)), np.zeros(0)
     radius = adaptation.hole * spacing
     if border is not None and cloud.dim == 3:
-        feet, normals, wide = map(np.asarray, border_gaps(cloud, border, radius))
+        feet, normals, wide = border_gaps(cloud, border, radius)
     pairs = close_pairs(cloud, lists, adaptation.closest * spacing, rank)
     holes, size = fillings(cloud, lists, radius)
     wanted = np.concatenate([wide, size]) / adaptation.hole
@@ -268,10 +268,10 @@ def _interpolated(cloud, neighbors, degree: int, at, arrays) -> PyTree[np.ndarra
     In NumPy where their number counts: nothing is compiled for it.
     """
     leaves, structure = jax.tree.flatten(arrays)
-    together = np.concatenate([np.reshape(u, (len(u), -1)) for u in leaves], axis=1)
+    together = np.concatenate([np.asarray(u).reshape(len(u), -1) for u in leaves], axis=1)
     count, at = len(at), at.astype(cloud.points.dtype)
     found = np.array(interpolated(cloud, neighbors, degree, on_device(at), on_device(together)))
-    parts = np.split(found, np.cumsum([u[0].size for u in leaves])[:-1], axis=1)
+    parts = np.split(found, np.cumsum([u.size // len(u) for u in leaves])[:-1], axis=1)
     parts = [v.reshape(count, *u.shape[1:]).astype(u.dtype) for u, v in zip(leaves, parts)]
     points, normals, fields = jax.tree.unflatten(structure, parts)
     return points, normals / np.linalg.norm(normals, axis=1, keepdims=True), fields

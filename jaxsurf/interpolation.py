@@ -36,7 +36,7 @@ def interpolated(
         "points: {i} is {v:.3g} away from the nearest point of the cloud, farther than the "
         "neighbours of that reach"
     )
-    points = refuse(points, _beyond(distance, reach), text, distance)
+    points = refuse(points, beyond(distance, reach), text, distance)
     return read_from(cloud, neighbors, degree, points, centers, u)[0]
 
 
@@ -128,8 +128,9 @@ def distance_and_reach(cloud, neighbors, points, centers):
 
 
 @copying_jit
-def _beyond(distance, reach):
-    return distance > reach
+def beyond(distance, reach):
+    """Whether something is farther than it may be, or no number."""
+    return ~(distance <= reach)
 
 
 @copying_jit

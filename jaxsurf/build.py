@@ -231,8 +231,8 @@ def _chosen(cloud, method, throw, needed, fewest):
 
     olds = lists[0].T, lists[1].T, *jax.tree.leaves(found)
     indices, mask, *leaves = map(put, olds, kept)
-    lists = Neighbors(on_device(indices.T), on_device(mask.T))
-    return lists, jax.tree.unflatten(jax.tree.structure(found), map(on_device, leaves))
+    new = Neighbors(on_device(indices.T), on_device(mask.T))
+    return new, jax.tree.unflatten(jax.tree.structure(found), map(on_device, leaves))
 
 
 def _in_chunks(cloud, indices, mask, method, rows):

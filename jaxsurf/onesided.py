@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -163,7 +164,7 @@ def _without_bound(neighbors: Neighbors, rows):
     """Lists of some rows without the others of these, slots of other points, the rows as a mask."""
     slots = neighbors.indices[rows]
     if namespace(rows) is np:
-        bound = np.zeros(neighbors.n, bool)
+        bound: Any = np.zeros(neighbors.n, bool)
         bound[rows] = True
     else:
         bound = jnp.zeros(neighbors.n, bool).at[rows].set(True)

@@ -248,7 +248,7 @@ def _placed(surface: Discretization, rows: Rows, found: _Sought) -> Rows:
     spacing = np.concatenate([merged, found.spacing]).astype(rows.spacing.dtype)
     ranks = np.zeros(len(at), rank.dtype)
     ranks[: len(pairs)], ranks[edge] = rank[pairs[:, 0]], 1
-    return jax.tree.map(on_device, Rows(points, normals, fields, spacing, ranks))
+    return Rows(*jax.tree.map(on_device, (points, normals, fields, spacing, ranks)))
 
 
 def conserved(before: Discretization, old, after: Discretization, new) -> PyTree[Array]:

@@ -22,7 +22,7 @@ else:
 # Quicker to compile, slower to run; `is_quick` asks for simpler forms beside.
 _QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 # Blocks that are treated by one call where arrays are small.
-_PIECE = 16
+_PIECE = 8
 # Numbers given to a program, in all its arrays, below which it is small.
 _SMALL = 1_750_000
 # What is computed within is computed at once, also while something else is traced. (JAX's
@@ -119,6 +119,8 @@ def _by_pieces(program: Callable, blocks, args: tuple):
 
 
 def _filled_up(blocks: np.ndarray) -> np.ndarray:
+    if len(blocks) == _PIECE:
+        return blocks
     room = np.zeros((_PIECE, *blocks.shape[1:]), blocks.dtype)
     room[: len(blocks)] = blocks
     return room

@@ -122,9 +122,9 @@ def distance_and_reach(cloud, neighbors, points, centers):
     """How far points are from those of the cloud next to them, and how far these's lists reach."""
     x, points = constant((cloud.points, points))
     center, xp = x[centers], namespace(x)
-    length = lambda vectors: xp.sqrt(xp.sum(vectors**2, axis=-1))
-    away = xp.where(neighbors.mask[centers].T, length(x[neighbors.indices[centers].T] - center), 0)
-    return length(points - center), xp.max(away, axis=0)
+    squared = lambda vectors: xp.einsum("...d,...d->...", vectors, vectors)
+    away = xp.where(neighbors.mask[centers].T, squared(x[neighbors.indices[centers].T] - center), 0)
+    return xp.sqrt(squared(points - center)), xp.sqrt(xp.max(away, axis=0))
 
 
 @copying_jit
@@ -136,7 +136,8 @@ def beyond(distance, reach):
 @copying_jit
 def _summed(weights, slots, u):
     if namespace(weights) is np:
-        return np.einsum("km,km...->m...", weights, u[slots])
+        columns = np.moveaxis(u, 0, -1)
+        return np.moveaxis(sum(w * columns[..., s] for w, s in zip(weights, slots)), -1, 0)
     weights = weights.reshape(*weights.shape, *(1,) * (u.ndim - 1))
     add = lambda total, slot: (total + slot[0] * u[slot[1]], None)
     zero = jnp.zeros((slots.shape[1], *u.shape[1:]), jnp.result_type(weights, u))

@@ -243,10 +243,11 @@ def blockwise(f: Callable, blocks, count=None):
     if count is None:
         return jax.lax.map(jax.checkpoint(f), blocks)
     f = jax.jit(f)  # traced once
-    block = lambda i: jax.tree.map(lambda a: a[i], blocks)
+    at, put_at = jax.lax.dynamic_index_in_dim, jax.lax.dynamic_update_index_in_dim
+    block = lambda i: jax.tree.map(lambda a: at(a, i, keepdims=False), blocks)
     total = len(jax.tree.leaves(blocks)[0])
     room = jax.tree.map(
         lambda a: jnp.zeros((total, *a.shape), a.dtype), jax.eval_shape(lambda: f(block(0)))
     )
-    put = lambda i, room: jax.tree.map(lambda r, a: r.at[i].set(a), room, f(block(i)))
+    put = lambda i, room: jax.tree.map(lambda r, a: put_at(r, a, i, 0), room, f(block(i)))
     return jax.lax.fori_loop(0, count, put, room)

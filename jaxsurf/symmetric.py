@@ -31,7 +31,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .borders.border import Border
 from .cloud import PointCloud
-from .compiling import is_quick, sized_jit
+from .compiling import sized_jit
 from .fits.kernels import gaussian
 from .fits.plane import Neighborhood, TangentPlane, dot
 from .neighbors import Neighbors
@@ -197,12 +197,11 @@ def positive_weights(cloud, neighbors, masses, flux):
     """
     pairs = Pairs.of(cloud, neighbors, masses, flux)
     mu = _multipliers(jax.lax.stop_gradient(pairs))
-    if not is_quick():  # else nothing is differentiated
-        # Zero, with the derivative of what moves the solution.
-        rest = pairs.rest(mu)
-        rest = rest - jax.lax.stop_gradient(rest)
-        exact = functools.partial(jax.lax.custom_linear_solve, symmetric=True)
-        mu = mu - pairs.solved(mu, rest, _tolerance(rest), exact)
+    # Zero, with the derivative of what moves the solution.
+    rest = pairs.rest(mu)
+    rest = rest - jax.lax.stop_gradient(rest)
+    exact = functools.partial(jax.lax.custom_linear_solve, symmetric=True)
+    mu = mu - pairs.solved(mu, rest, _tolerance(rest), exact)
     s = pairs.kernel * _positive(pairs.forces(mu))[0]
     left = jnp.max(jnp.abs(pairs.moments(s) - pairs.wanted), axis=0) / (2 * pairs.unit)
     return s, jax.lax.stop_gradient(left)

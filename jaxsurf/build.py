@@ -13,7 +13,7 @@ from .adapt import dominance, is_better, represented, share_wanted, sizes_to_try
 from .adapt import residual_tolerance as residual_tolerance
 from .arguments import as_many, instance, whole
 from .cloud import PointCloud
-from .compiling import at_once, copying_jit, namespace, sized_jit
+from .compiling import at_once, copying_jit, namespace, on_device, pieces_jit
 from .failures import (
     is_concrete,
     needs_values,
@@ -82,7 +82,7 @@ def choose_neighbors(
         needed = ~np.asarray(checked_mask(bound, cloud.n, "bound"))
     neighbors = _adapted(cloud, method, throw, needed)[0]
     mask = np.asarray(neighbors.mask) & needed[:, None]
-    return Neighbors(neighbors.indices, jnp.asarray(mask), neighbors.radius)
+    return Neighbors(neighbors.indices, on_device(mask), neighbors.radius)
 
 
 def choose_fewer_neighbors(cloud: PointCloud, method: AbstractMethod) -> Neighbors:
@@ -156,9 +156,9 @@ def _slots_first(indices):
     return indices.T
 
 
-@sized_jit
-def _weights_of_blocks(blocks, method, target):
-    return blockwise(lambda block: weights_by(method, neighborhood(block), target), blocks)
+@pieces_jit
+def _weights_of_blocks(blocks, count, method, target):
+    return blockwise(lambda block: weights_by(method, neighborhood(block), target), blocks, count)
 
 
 def neighborhood(block) -> Neighborhood:
@@ -195,7 +195,7 @@ def _chosen(cloud, method, throw, needed, fewest):
     neighbors = find_neighbors(cloud, k, throw=throw)
     _check_sizes(cloud, neighbors, method, Laplacian(), throw)
     found = stencil_weights(cloud, neighbors, method, Laplacian())
-    share = np.asarray(dominance(found[1]))
+    share = dominance(jax.tree.map(np.asarray, found[1]))
     poor = np.flatnonzero(on & needed & (share < method.least_dominance))
     sizes, fewest = sizes_to_try(method, cloud.dim, k, available), k if fewest is None else fewest
     border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
@@ -227,11 +227,12 @@ def _chosen(cloud, method, throw, needed, fewest):
     def put(old, new):
         full = np.array(old)
         full[..., rows] = new
-        return jnp.asarray(full)
+        return full
 
     olds = lists[0].T, lists[1].T, *jax.tree.leaves(found)
     indices, mask, *leaves = map(put, olds, kept)
-    return Neighbors(indices.T, mask.T), jax.tree.unflatten(jax.tree.structure(found), leaves)
+    new = Neighbors(on_device(indices.T), on_device(mask.T))
+    return new, jax.tree.unflatten(jax.tree.structure(found), map(on_device, leaves))
 
 
 def _in_chunks(cloud, indices, mask, method, rows):
@@ -239,8 +240,8 @@ def _in_chunks(cloud, indices, mask, method, rows):
     parts = []
     for start in range(0, len(rows), _CHUNK):
         part = slice(start, start + _CHUNK)
-        some = Rows(jnp.asarray(indices[part]), jnp.asarray(mask[part]))
-        parts.append(stencil_weights(cloud, some, method, Laplacian(), jnp.asarray(rows[part])))
+        some = Rows(indices[part], mask[part])
+        parts.append(stencil_weights(cloud, some, method, Laplacian(), rows[part]))
     return jax.tree.map(lambda *a: np.concatenate([np.asarray(b) for b in a], axis=-1), *parts)
 
 
@@ -298,4 +299,9 @@ def determined(weights, residual, degree: int):
         f"the neighbours of point {{i}} do not determine a polynomial of degree {degree}: relative "
         "moment residual {v:.1e}"
     )
-    return refuse(weights, ~(residual < residual_tolerance(residual.dtype)), text, residual)
+    return refuse(weights, _undetermined(residual), text, residual)
+
+
+@copying_jit
+def _undetermined(residual):
+    return ~(residual < residual_tolerance(residual.dtype))

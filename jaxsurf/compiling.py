@@ -21,6 +21,8 @@ else:
 
 # Quicker to compile, slower to run; `is_quick` asks for simpler forms beside.
 _QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
+# Blocks that are treated by one call where arrays are small.
+_PIECE = 8
 # Numbers given to a program, in all its arrays, below which it is small.
 _SMALL = 1_750_000
 # What is computed within is computed at once, also while something else is traced. (JAX's
@@ -42,6 +44,23 @@ def sized_jit(f: Callable) -> Callable:
     optimisations; so does a jaxlib that does not know the options.
     """
 
+    thorough, quick = _programs(f)
+
+    @functools.wraps(f)
+    def call(*args):
+        if _takes_longer_to_compile(jax.tree.leaves(args)):
+            try:
+                return quick(*args)
+            except ValueError:  # within another program, if only with constants
+                pass
+        return thorough(*args)
+
+    return call
+
+
+def _programs(f: Callable) -> tuple[Callable, Callable]:
+    """A function compiled with all optimisations and with fewer; what is no array is static."""
+
     def program(arrays, others, structure):
         leaves = [other if array is None else array for array, other in zip(arrays, others)]
         return f(*jax.tree.unflatten(structure, leaves))
@@ -53,23 +72,64 @@ def sized_jit(f: Callable) -> Callable:
         finally:
             quickly.reset(token)
 
+    def called(compiled):
+        def call(*args):
+            leaves, structure = jax.tree.flatten(args)
+            arrays = [a if is_array(a) else None for a in leaves]
+            others = tuple(None if is_array(a) else a for a in leaves)
+            return compiled(arrays, others, structure)
+
+        return call
+
     program.__name__ = quick_program.__name__ = f.__name__
-    thorough = jax.jit(program, static_argnums=(1, 2))
     quick = jax.jit(quick_program, static_argnums=(1, 2), compiler_options=_QUICK)
+    return called(jax.jit(program, static_argnums=(1, 2))), called(quick)
+
+
+def pieces_jit(f: Callable) -> Callable:
+    """`sized_jit` for a function of blocks, `f(blocks, count, ...)`, that treats one after another.
+
+    Where the arrays are small it is called on pieces of so many blocks, filled up, and told how
+    many count: any number of points shares one program. Else `count` is None: all.
+    """
+    thorough, quick = _programs(f)
 
     @functools.wraps(f)
-    def call(*args):
-        leaves, structure = jax.tree.flatten(args)
-        arrays = [a if is_array(a) else None for a in leaves]
-        others = tuple(None if is_array(a) else a for a in leaves)
+    def call(blocks, *args):
+        leaves = jax.tree.leaves((blocks, args))
         if _takes_longer_to_compile(leaves):
             try:
-                return quick(arrays, others, structure)
+                return _by_pieces(quick, jax.tree.map(np.asarray, blocks), args)
             except ValueError:  # within another program, if only with constants
                 pass
-        return thorough(arrays, others, structure)
+        return thorough(blocks, None, *args)
 
     return call
+
+
+def _by_pieces(program: Callable, blocks, args: tuple):
+    leaves, structure = jax.tree.flatten(blocks)
+    parts = []
+    for first in range(0, len(leaves[0]), _PIECE):
+        rows = [a[first : first + _PIECE] for a in leaves]
+        piece, count = jax.tree.unflatten(structure, map(_filled_up, rows)), len(rows[0])
+        found, shape = jax.tree.flatten(program(piece, np.array(count, np.int32), *args))
+        parts.append([np.asarray(a)[:count] for a in found])
+    return jax.tree.unflatten(shape, map(np.concatenate, zip(*parts)))
+
+
+def _filled_up(blocks: np.ndarray) -> np.ndarray:
+    if len(blocks) == _PIECE:
+        return blocks
+    room = np.zeros((_PIECE, *blocks.shape[1:]), blocks.dtype)
+    room[: len(blocks)] = blocks
+    return room
+
+
+def on_device(a: AnyArray) -> jax.Array:
+    """An array as one of JAX, by a copy: `jnp.asarray` compiles one for every new shape."""
+    with at_once():
+        return jax.device_put(a)
 
 
 def copying_jit(f: Callable) -> Callable:

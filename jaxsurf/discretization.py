@@ -219,8 +219,7 @@ class Discretization(eqx.Module):
 
     def mean(self, u: Float[Array, "n *c"]) -> Float[Array, "*c"]:
         """Integral over area."""
-        areas = self.areas
-        return quadrature.integral(areas, self._field(u)) / jnp.sum(areas)
+        return quadrature.mean(self.areas, self._field(u))
 
     def inner(self, u: Float[Array, "n *c"], v: Float[Array, "n *c"]) -> Float[Array, ""]:
         r"""$\int_S u \cdot v\,dS$; of fields with components, the sum over them."""

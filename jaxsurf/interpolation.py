@@ -10,11 +10,12 @@ from scipy.spatial import cKDTree
 
 from .build import blocks_of, determined, neighborhood, rows_of
 from .cloud import PointCloud
-from .compiling import sized_jit
+from .compiling import copying_jit, namespace, on_device, pieces_jit
 from .failures import is_concrete, refuse
 from .fits.moments import blockwise, in_blocks, moment_solve
 from .fits.monomials import monomials
 from .fits.plane import TangentPlane
+from .functions import constant
 from .neighbors import Neighbors, Rows
 from .stencils.method import with_center
 
@@ -35,7 +36,7 @@ def interpolated(
         "points: {i} is {v:.3g} away from the nearest point of the cloud, farther than the "
         "neighbours of that reach"
     )
-    points = refuse(points, distance > reach, text, distance)
+    points = refuse(points, beyond(distance, reach), text, distance)
     return read_from(cloud, neighbors, degree, points, centers, u)[0]
 
 
@@ -66,7 +67,7 @@ def nearest_points(
     if is_concrete(among, on, points):
         rows = np.arange(len(among)) if on is None else np.flatnonzero(on)
         tree = cKDTree(np.asarray(among, float)[rows])
-        return jnp.asarray(rows[tree.query(np.asarray(points, float))[1]].astype(np.int32))
+        return on_device(rows[tree.query(np.asarray(points, float))[1]].astype(np.int32))
     return _nearest(jax.lax.stop_gradient(among), on, points)
 
 
@@ -91,15 +92,20 @@ def _interpolation_weights(
     Over the tangent plane of its centre each field is the polynomial that fits the neighbours and
     passes through the centre; it is read off where the point stands above that plane.
     """
-    radius = neighbors.radius
-    lists = Rows(neighbors.indices[centers], neighbors.mask[centers], radius)
+    slots, lists, at = _seen_from(cloud, neighbors, points, centers)
     blocks = blocks_of(cloud, lists, centers, _BATCH)
-    at = in_blocks((points - cloud.points[centers]).T, _BATCH)
-    return lists.indices.T, *rows_of(*_of_blocks(blocks, at, degree), len(points))
+    return slots, *rows_of(*_of_blocks((blocks, at), degree), len(points))
 
 
-@sized_jit
-def _of_blocks(blocks, offsets, degree: int):
+@copying_jit
+def _seen_from(cloud, neighbors, points, centers):
+    """Neighbours of the centres, slots first; their lists; ways to the points, in blocks."""
+    lists = Rows(neighbors.indices[centers], neighbors.mask[centers], neighbors.radius)
+    return lists.indices.T, lists, in_blocks((points - cloud.points[centers]).T, _BATCH)
+
+
+@pieces_jit
+def _of_blocks(blocks, count, degree: int):
     def weights(block):
         around, offset = neighborhood(block[0]), block[1]
         plane = TangentPlane.of(around, degree)
@@ -108,26 +114,30 @@ def _of_blocks(blocks, offsets, degree: int):
         eta, _, residual = moment_solve(plane.points, plane.weights, wanted, 1, degree)
         return jnp.where(around.mask, with_center(eta)[0].at[0].add(1), 0), residual
 
-    return blockwise(weights, (blocks, offsets))
+    return blockwise(weights, blocks, count)
 
 
-@jax.jit
+@copying_jit
 def distance_and_reach(cloud, neighbors, points, centers):
     """How far points are from those of the cloud next to them, and how far these's lists reach."""
-    x = jax.lax.stop_gradient(cloud.points)
-    center = x[centers]
-    away = jnp.where(
-        neighbors.mask[centers].T, _length(x[neighbors.indices[centers].T] - center), 0
-    )
-    return _length(jax.lax.stop_gradient(points) - center), jnp.max(away, axis=0)
+    x, points = constant((cloud.points, points))
+    center, xp = x[centers], namespace(x)
+    squared = lambda vectors: xp.einsum("...d,...d->...", vectors, vectors)
+    away = xp.where(neighbors.mask[centers].T, squared(x[neighbors.indices[centers].T] - center), 0)
+    return xp.sqrt(squared(points - center)), xp.sqrt(xp.max(away, axis=0))
 
 
-def _length(vectors):
-    return jnp.sqrt(jnp.sum(vectors**2, axis=-1))
+@copying_jit
+def beyond(distance, reach):
+    """Whether something is farther than it may be, or no number."""
+    return ~(distance <= reach)
 
 
-@jax.jit
+@copying_jit
 def _summed(weights, slots, u):
+    if namespace(weights) is np:
+        columns = np.moveaxis(u, 0, -1)
+        return np.moveaxis(sum(w * columns[..., s] for w, s in zip(weights, slots)), -1, 0)
     weights = weights.reshape(*weights.shape, *(1,) * (u.ndim - 1))
     add = lambda total, slot: (total + slot[0] * u[slot[1]], None)
     zero = jnp.zeros((slots.shape[1], *u.shape[1:]), jnp.result_type(weights, u))

@@ -138,7 +138,7 @@ def unreached(before, after, neighbors, share=_SKIN):
     return stretch * farthest < share * jnp.max(new, axis=0)
 
 
-@jax.jit
+@sized_jit
 def code_of(cloud, neighbors, found_at, found, residual):
     """Codes of points, also of lists that no longer reach and of what was found with these."""
     code = judged(cloud, neighbors, residual)

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from .arguments import POINTS, as_float, finite, is_array, real, shaped, whole
 from .checks import check_count, check_orientation, check_overlap, check_spacing, two_sheets
 from .cloud import PointCloud
+from .compiling import on_device
 from .failures import (
     check,
     is_concrete,
@@ -212,8 +213,8 @@ def find_neighbors(
     indices[rows] = np.where(mask, rows[slots], indices[rows])
     accepted[rows] = mask
     return Neighbors(
-        jnp.asarray(indices),
-        jnp.asarray(accepted),
+        on_device(indices),
+        on_device(accepted),
         None if radius is None else jnp.asarray(radius, cloud.points.dtype),
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +15,7 @@ from .borders.order import find_border, inward
 from .boundary import Closure, Source, check_pivots
 from .build import residual_tolerance, stencil_weights
 from .cloud import PointCloud
+from .compiling import copying_jit, namespace, sized_jit
 from .conditions import Condition, checked_conditions
 from .discretization import Discretization
 from .failures import is_concrete, needs_values, raise_at
@@ -147,16 +149,32 @@ def without_flux(surface: Discretization) -> Closure | None:
     if border is None:
         return None
     rows = border.points
-    slots, own = neighbors.indices[rows], rows[:, None]
-    bound = jnp.zeros(cloud.n, bool).at[rows].set(True)
-    near = Rows(slots, neighbors.mask[rows] & (~bound[slots] | (slots == own)), None)
+    near, others, bound = _without_bound(neighbors, rows)
     w, residual = _outward_derivative(cloud, near, rows, border.conormals(cloud), method)
     if is_concrete(w):
-        names = np.asarray(rows)
+        names, known = np.asarray(rows), np.asarray(w)
         _check_stencils(names, near, residual, method, cloud.dim)
-        size = np.abs(w).sum(axis=0)
-        check_pivots(w[0], size, names, "value at point {i}: the weight w_i of its derivative")
-    return Closure(cloud.n, rows, slots.T[1:], -w[1:] / w[0], (), bound)
+        size = np.abs(known).sum(axis=0)
+        check_pivots(known[0], size, names, "value at point {i}: the weight w_i of its derivative")
+    return Closure(cloud.n, rows, others, _shares(w), (), bound)
+
+
+@copying_jit
+def _without_bound(neighbors: Neighbors, rows):
+    """Lists of some rows without the others of these, slots of other points, the rows as a mask."""
+    slots = neighbors.indices[rows]
+    if namespace(rows) is np:
+        bound: Any = np.zeros(neighbors.n, bool)
+        bound[rows] = True
+    else:
+        bound = jnp.zeros(neighbors.n, bool).at[rows].set(True)
+    near = Rows(slots, neighbors.mask[rows] & (~bound[slots] | (slots == rows[:, None])), None)
+    return near, slots.T[1:], bound
+
+
+@copying_jit
+def _shares(w):
+    return -w[1:] / w[0]
 
 
 # Weights of one sign begin to take over where the curvature times the reach of a stencil is this,
@@ -179,8 +197,15 @@ def _outward_derivative(cloud, near: Rows, rows, conormals, method: AbstractMeth
     extrapolate to a rough border can be a hundred times the values it comes from, and grows.
     """
     gradient, diagnostics = stencil_weights(cloud, near, method, Gradient(), rows)
+    degree = method.polynomial_degree
+    return _outward(gradient, cloud.seen, near, rows, conormals, degree), diagnostics.residual
+
+
+@sized_jit
+def _outward(gradient, seen, near: Rows, rows, conormals, degree: int) -> Float[Array, "k m"]:
+    """Those of a gradient along conormals, or of one sign."""
     weights = jnp.einsum("md,kdm->km", conormals, gradient)
-    seen, used = cloud.seen, near.mask.T
+    used = near.mask.T
     offsets = seen.points[near.indices] - seen.points[rows][:, None]
     turn = jnp.sum(offsets * (seen.normals[near.indices] - seen.normals[rows][:, None]), axis=2).T
     squared = jnp.sum(offsets**2, axis=2).T
@@ -191,7 +216,7 @@ def _outward_derivative(cloud, near: Rows, rows, conormals, method: AbstractMeth
     bend = jnp.where(on, jnp.abs(turn) / jnp.where(on, squared, 1), 0) * reach
     bent = ramp((power_mean(bend, on.astype(bend.dtype)) - _BENT) / _BEYOND)
     others, own = jnp.sum(jnp.abs(weights[1:]), axis=0), jnp.abs(weights[0])
-    usual = 1.5 * 8 ** ((method.polynomial_degree - 2) / 4)
+    usual = 1.5 * 8 ** ((degree - 2) / 4)
     gain = others / jnp.where(own > 0, usual * own, 1)
     loud = jnp.where(own > 0, ramp((gain - _GAIN) / (_MOST_GAIN - _GAIN)), 1)
     part = bent + loud - bent * loud
@@ -202,7 +227,7 @@ def _outward_derivative(cloud, near: Rows, rows, conormals, method: AbstractMeth
     one_sign = -kernel * inwards / jnp.where(second > 0, second, 1)
     one_sign = one_sign.at[0].set(-jnp.sum(one_sign[1:], axis=0))
     blend = weights + part * (one_sign - weights)
-    return jnp.where((part > 0) & (second > 0), blend, weights), diagnostics.residual
+    return jnp.where((part > 0) & (second > 0), blend, weights)
 
 
 def check_parts(cloud, neighbors, border) -> None:

@@ -10,7 +10,6 @@ all neighbours, exactly as those of a derivative come from its values on monomia
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 
 import jax
@@ -20,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from .build import blocks_of, determined, neighborhood, rows_of
 from .cloud import PointCloud
-from .compiling import sized_jit
+from .compiling import copying_jit, namespace, sized_jit
 from .failures import is_concrete, refuse, warn
 from .fits.graph import Graph
 from .fits.moments import blockwise, in_blocks, moment_solve
@@ -63,8 +62,9 @@ def areas(
         "the neighbours of point {i} do not close its cell, out of {v} of them: mark the "
         "border of the surface (`boundary`), or choose more neighbours"
     )
-    weights = refuse(weights, ~closed, text, jnp.sum(neighbors.mask, axis=1))
-    return _summed(determined(weights, residual, degree), neighbors.indices.T)
+    bad, count = _open(closed, neighbors.mask)
+    weights = refuse(weights, bad, text, count)
+    return _summed(determined(weights, residual, degree), neighbors.indices)
 
 
 def cell_areas(
@@ -79,7 +79,7 @@ def cell_areas(
     """
     look = lambda cells: _cell_sizes(cloud, neighbors, degree, cells, outward)
     sizes, closed = _by_enough(look, neighbors.k)
-    if is_concrete(closed) and not closed.all():
+    if is_concrete(closed) and not np.all(closed):
         warn(
             f"the cells of {int((~closed).sum())} points, the first {int(jnp.argmin(closed))}, "
             "are not closed by their neighbours and are given the mean area of theirs: is a "
@@ -89,15 +89,16 @@ def cell_areas(
     return refuse(sizes, bad, "the cell of point {i} has the area {v}", sizes)
 
 
-@jax.jit
+@copying_jit
 def _completed(sizes, closed, neighbors):
     """With the mean of the neighbours in place of what is not closed; where there is none."""
+    xp = namespace(sizes)
     good = closed & (sizes > 0)
     counted = neighbors.mask & good[neighbors.indices]
-    total = jnp.sum(jnp.where(counted, sizes[neighbors.indices], 0), axis=1)
-    mean = total / jnp.maximum(jnp.sum(counted, axis=1), 1)
+    total = xp.sum(xp.where(counted, sizes[neighbors.indices], 0), axis=1)
+    mean = total / xp.maximum(xp.sum(counted, axis=1), 1)
     on = neighbors.mask[:, 0]
-    sizes = jnp.where(good | ~on, sizes, mean)
+    sizes = xp.where(good | ~on, sizes, mean)
     return sizes, on & ~(sizes > 0)
 
 
@@ -105,18 +106,33 @@ def _by_enough(look: Callable, k: int):
     """What the usual number of sides gives; where that closes not all cells, all neighbours."""
     found = look(_CELLS)
     closed = found[1]
-    return look(k) if is_concrete(closed) and not closed.all() else found
+    return look(k) if is_concrete(closed) and not np.all(closed) else found
 
 
-@jax.jit
+@copying_jit
+def _open(closed, mask):
+    """Whether cells are not closed, and out of how many neighbours."""
+    return ~closed, mask.sum(axis=1)
+
+
+@copying_jit
 def _summed(weights, indices):
-    return jnp.zeros(weights.shape[1], weights.dtype).at[indices].add(weights)
+    n, slots = weights.shape[1], indices.T
+    if namespace(weights) is np:
+        return np.bincount(slots.ravel(), weights.ravel(), n).astype(weights.dtype)
+    return jnp.zeros(n, weights.dtype).at[slots].add(weights)
 
 
 @jax.jit
 def integral(areas, u):
     """Of a field or of each of its components."""
     return jnp.tensordot(areas, u, 1)
+
+
+@jax.jit
+def mean(areas, u):
+    """Integral over area."""
+    return integral(areas, u) / jnp.sum(areas)
 
 
 def cell_weights(
@@ -151,15 +167,15 @@ def _cell_sizes(cloud, neighbors, degree, cells, outward):
     return sizes, closed
 
 
-@functools.partial(jax.jit, static_argnums=1)
+@copying_jit
 def _scaled(width, dim: int, moments):
     return width**dim * moments[:, 0]
 
 
-@jax.jit
+@copying_jit
 def _where_on(mask, closed, values):
     on = mask[:, 0]
-    return closed | ~on, jnp.where(on, values, 0)
+    return closed | ~on, namespace(values).where(on, values, 0)
 
 
 def _cells(cloud, neighbors, degree, cells, outward):

@@ -7,7 +7,6 @@ dominant centre are taken out, some at a time, for as long as there are any.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -15,6 +14,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .adapt import dominance, is_better, represented, share_wanted, sizes_to_try
@@ -108,7 +108,7 @@ class NeighborSearch(eqx.Module):
         def tier(wanted: int, least: int) -> Tier:
             wanted = min(wanted, available)
             reach = max(least, math.ceil(_SLACK * (wanted / usual) ** (1 / (d - 1))))
-            room = min(cloud.n, math.ceil(margin * int(jnp.max(_candidates(grid, reach)))))
+            room = min(cloud.n, math.ceil(margin * int(np.max(_candidates(grid, reach)))))
             # Few sizes: surfaces of as many points share a program.
             return Tier(wanted, reach, -(-room // _ROUND) * _ROUND)
 
@@ -123,8 +123,8 @@ class NeighborSearch(eqx.Module):
         )
 
 
-@functools.partial(jax.jit, static_argnums=1)
-def _candidates(grid, reach):
+@sized_jit
+def _candidates(grid, reach: int):
     rows = jnp.arange(len(grid.order), dtype=jnp.int32)
     return jax.lax.map(lambda i: grid.candidates(i[None], reach, 1)[1][0], rows, batch_size=1024)
 
@@ -173,7 +173,7 @@ class _Lists(eqx.Module):
     code: Int[Array, " r"]
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3))
+@sized_jit
 def _reach(cloud, before, k: int, usual: int):
     """Within which most points find `usual` neighbours, from where their last k are now."""
     x = cloud.points
@@ -199,7 +199,7 @@ def _reach(cloud, before, k: int, usual: int):
     return (1 + 1e-6) * most
 
 
-@jax.jit
+@sized_jit
 def _grid(cloud, reach):
     on = all_on(cloud.points, cloud.active)
     return Grid.of(cloud.points, cloud.normals, on, reach)

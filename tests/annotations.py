@@ -8,7 +8,7 @@ either the function or its annotation is wrong. Arrays of NumPy are as good as J
 import functools
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from beartype import BeartypeConf, beartype
 from beartype.roar import BeartypeCallHintParamViolation
@@ -39,4 +39,7 @@ def check(function):
 
 
 def _as_jax(value):
-    return jnp.asarray(value) if isinstance(value, np.ndarray | np.generic) else value
+    if not isinstance(value, np.ndarray | np.generic):
+        return value
+    with jax.core.eval_context():  # a copy, for which nothing is compiled
+        return jax.device_put(value)

@@ -9,6 +9,8 @@ import jaxsurf as js
 from jaxsurf.moving import follow
 from jaxsurf.moving.holes import _sides, circumcenters, large_triangles
 
+from .helpers import count_compilations
+
 RNG = np.random.default_rng(5)
 METHOD = js.GFDM(degree=4)
 
@@ -52,6 +54,28 @@ def test_holes_are_filled_and_crowds_thinned():
     # What is as wanted stays as it is.
     again = js.adapt_points(found.surface, js.Adaptation(spacing=h), found.fields)
     assert again.surface is found.surface and not again.added + again.merged
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("capacity", [None, 2_000])
+def test_another_number_of_points_compiles_nothing(closed, capacity):
+    """Holes, crowds and gaps of a border, on another surface, of another spacing."""
+
+    def use(n, spacing, stretch):
+        cloud = js.sphere(n) if closed else js.graph(lambda x, y: stretch * x * y, n)
+        cloud = js.PointCloud(stretch * cloud.points, cloud.normals, boundary=cloud.boundary)
+        surface = js.discretize(cloud, method=js.GFDM(degree=2))
+        surface.laplacian(cloud.points)
+        with count_compilations() as names:
+            how = js.Adaptation(spacing * stretch, capacity=capacity)
+            found = js.adapt_points(surface, how, cloud.points[:, 2])
+        return names, found.added, found.merged
+
+    use(700, 0.09, 1.0), use(900, 0.4, 1.1)
+    names, added, _ = use(700, 0.1, 1.3)
+    assert added and not names, names
+    names, _, merged = use(900, 0.44, 1.2)
+    assert merged and not names, names
 
 
 def test_all_empty_circles_are_found():

@@ -185,6 +185,25 @@ def test_cycles_at_the_prompt_compile_once():
     assert not names, names
 
 
+def test_steps_on_another_surface_compile_nothing():
+    """Where its coarsest levels have a few long rows more, too."""
+
+    def use(factors):
+        axes = jnp.array(factors)
+        normals = js.sphere(2_500).points / axes
+        normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+        cloud = js.PointCloud(axes * js.sphere(2_500).points, normals)
+        problem = js.AdvectionDiffusionReaction(js.laplace_beltrami(cloud))
+        u = cloud.points[:, 0]
+        with count_compilations() as names:
+            js.step_preconditioner(problem, u)(0.1).mv(u)
+        return names
+
+    use((1.0, 1.0, 1.0))
+    names = [use(factors) for factors in ((1.1, 1.0, 0.9), (1.3, 1.0, 0.8), (1.0, 1.0, 1.05))]
+    assert not any(names), names
+
+
 def test_without_pyamg_the_extra_and_the_alternative_are_named(monkeypatch):
     operator = js.laplace_beltrami(js.sphere(1_000)) - 1
     for name in ("pyamg", "pyamg.aggregation", "pyamg.strength"):

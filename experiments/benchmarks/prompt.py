@@ -283,7 +283,7 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
     "rigid_motion": (
         "closed",
         "",
-        lambda m: js.rigid_motion(m.cloud.points[0], (m.number * np.ones(3), np.ones(3))),
+        lambda m: js.rigid_motion(m.cloud.points[0], (m.number * jnp.ones(3), jnp.ones(3))),
     ),
     "spherical_harmonics": ("closed", "", lambda m: js.spherical_harmonics(m.cloud.normals, 4)),
     "taylor_remainders": (
@@ -454,8 +454,8 @@ def _nonlinear(u, args):
     return -u - args * u**3
 
 
-def one(name: str, n: int) -> dict:
-    """First call, five more, and two with another surface and other numbers."""
+def before(name: str, n: int) -> tuple[Callable, Made, Made]:
+    """A call and what it needs, also for another surface and other numbers."""
     surface, needs, call = CALLS[name]
     cloud = js.sphere(n) if surface == "closed" else js.graph(_saddle, n)
     clouds = [cloud, stretched(cloud)]
@@ -464,14 +464,20 @@ def one(name: str, n: int) -> dict:
     made, other = (Made(c, number) for c, number in zip(clouds, (1.0, 1.1)))
     for need in needs.split():
         jax.block_until_ready((getattr(made, need), getattr(other, need)))
+    return call, made, other
+
+
+def one(name: str, n: int) -> dict:
+    """First call, five more, and one with another surface and other numbers."""
+    call, made, other = before(name, n)
     compiler = _Compiler()
     first = clock(lambda: call(made))
     programs = compiler.programs
     again, above = [], []
     for _ in range(5):
-        before = compiler.seconds
+        spent = compiler.seconds
         again.append(clock(lambda: call(made)))
-        above.append(min(again[-1], compiler.seconds - before))
+        above.append(min(again[-1], compiler.seconds - spent))
     repeated = compiler.programs - programs
     new = clock(lambda: call(other))
     return {"first s": first, "again s": statistics.median(again),

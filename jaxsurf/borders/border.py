@@ -8,12 +8,14 @@ it is as accurate as the stencils that use it; rows end at corners.
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..arguments import instance, shaped
 from ..cloud import PointCloud
+from ..compiling import sized_jit
 from ..failures import check, is_concrete
 from ..frames import tangent_frames
 
@@ -65,11 +67,14 @@ class Border(eqx.Module):
         before, after = np.asarray(self.rows)
         return np.any(before != after, axis=1)
 
-    @eqx.filter_jit
+    @sized_jit
     def conormals(self, cloud: PointCloud) -> Float[Array, "m d"]:
         """Outward unit conormals; at a corner the mean direction of both sides."""
-        sides = [self.side_conormals(cloud, side) for side in (0, 1)]
-        total = sides[0] + sides[1]
+        m = len(self.points)
+        # Both sides together: the geometry there is compiled once.
+        side, slot = jnp.divmod(jnp.arange(2 * m), m)
+        both = self.at(cloud, side, slot, cloud.points[self.points[slot]])[2]
+        total = both[:m] + both[m:]
         return total / jnp.linalg.norm(total, axis=1, keepdims=True)
 
     def side_conormals(self, cloud: PointCloud, side: int) -> Float[Array, "m d"]:
@@ -77,7 +82,7 @@ class Border(eqx.Module):
         slot = jnp.arange(len(self.points))
         return self.at(cloud, side, slot, cloud.points[self.points])[2]
 
-    @eqx.filter_jit
+    @sized_jit
     def at(self, cloud: PointCloud, side, slot, near: Float[Array, "p d"]):
         """Foot points on the border, and the geometry there.
 
@@ -102,12 +107,15 @@ class Border(eqx.Module):
         axis = chord / jnp.linalg.norm(chord, axis=1, keepdims=True)
         nodes = jnp.einsum("prd,pd->pr", points - centre[:, None], axis)
         x = jnp.einsum("pd,pd->p", near - centre, axis)
-        for _ in range(_NEWTON):
+
+        def nearer(x, _):
             value, slope = _lagrange(nodes, mask, x)
             foot = jnp.einsum("pr,prd->pd", value, points)
             tangent = jnp.einsum("pr,prd->pd", slope, points)
             away = jnp.einsum("pd,pd->p", near - foot, tangent)
-            x = x + away / jnp.sum(tangent**2, axis=1)
+            return x + away / jnp.sum(tangent**2, axis=1), None
+
+        x = jax.lax.scan(nearer, x, None, length=_NEWTON)[0]
         value, slope = _lagrange(nodes, mask, x)
         foot = jnp.einsum("pr,prd->pd", value, points)
         tangent = jnp.einsum("pr,prd->pd", slope, points)

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from ..arguments import instance
 from ..cloud import PointCloud
+from ..compiling import on_device
 from ..failures import needs_values, without_derivatives
 from ..shapes.meshes import TriangleMesh
 from ..sheets import distance_key
@@ -229,9 +230,9 @@ def _with_rows(cloud, paths) -> Border:
     if count.max() > 1:
         raise ValueError(f"point {unique[np.argmax(count)]} lies on {count.max()} borders")
     return Border(
-        jnp.asarray(np.array(names, np.int32)),
-        jnp.asarray(np.array(rows, np.int32)),
-        jnp.asarray(np.array(masks)),
+        on_device(np.array(names, np.int32)),
+        on_device(np.array(rows, np.int32)),
+        on_device(np.array(masks)),
     )
 
 
@@ -278,4 +279,4 @@ def _ends(points, on, border) -> Border:
     near = on[cKDTree(points[on]).query(points[border], 2)[1][:, 1]]
     rows = np.stack([border, near], axis=1).astype(np.int32)
     rows = np.broadcast_to(rows, (2, *rows.shape))
-    return Border(jnp.asarray(border), jnp.asarray(rows), jnp.ones(rows.shape, bool))
+    return Border(on_device(border), on_device(rows), on_device(np.ones(rows.shape, bool)))

@@ -17,12 +17,13 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
 from ..arguments import as_float, finite, instance, real, switched_off
-from ..build import residual_tolerance
+from ..build import determined, residual_tolerance
 from ..compiling import sized_jit
 from ..discretization import Discretization
 from ..failures import is_concrete, needs_values, refuse, without_derivatives
 from ..frames import frames_of
-from ..interpolation import distance_and_reach, nearest_points, read_from
+from ..functions import constant
+from ..interpolation import beyond, distance_and_reach, nearest_points, read_from
 from ..motion import crossed
 from ..solve.steady import solve
 
@@ -193,17 +194,21 @@ def signed_distance(surface: Discretization, points: Float[Array, "m d"]) -> Flo
     seen = without_derivatives(known)
     fixed, lists, y = stop_gradient(seen if is_concrete(seen) else known)
     nearest = nearest_points(fixed.points, cloud.active, y)
-    feet = stop_gradient(_feet(fixed, lists, y, nearest, degree))
+    feet = constant(_feet(fixed, lists, y, nearest, degree))
     text = (
         "points: the foot of {i} is not found: it is {v:.3g} away from the nearest point of the "
         "cloud, whose neighbours reach {reach:.3g}"
     )
-    points = refuse(points, ~(feet.distance <= feet.reach), text, feet.distance, reach=feet.reach)
+    points = refuse(
+        points, beyond(feet.distance, feet.reach), text, feet.distance, reach=feet.reach
+    )
     text = (
         "points: the foot of {i} is not found: the way to it leans {v:.3g} off the normal, at most "
         "{most:.1e} is allowed; it may be nearer to a centre of curvature than to the surface"
     )
-    points = refuse(points, ~(feet.left <= feet.most), text, feet.left, most=feet.most)
+    points = refuse(points, beyond(feet.left, feet.most), text, feet.left, most=feet.most)
+    if is_concrete(known, feet):  # at the prompt nothing is read again
+        return determined(feet.height, feet.residual, degree)
     f, n, _ = _above(cloud, neighbors, degree, feet.place, feet.center)
     return _along(points - f, n)[:, 0]
 
@@ -218,6 +223,8 @@ class _Feet(NamedTuple):
         most: what is allowed of it.
         distance: of a foot from the point of the cloud,
         reach: how far the list of that one reaches.
+        residual: of the fit there.
+        height: of the point above its foot.
     """
 
     place: Float[Array, "m d"]
@@ -226,6 +233,8 @@ class _Feet(NamedTuple):
     most: Float[Array, " m"]
     distance: Float[Array, " m"]
     reach: Float[Array, " m"]
+    residual: Float[Array, " m"]
+    height: Float[Array, " m"]
 
 
 @sized_jit
@@ -242,7 +251,9 @@ def _feet(cloud, neighbors, points, nearest, degree: int) -> _Feet:
         distance, reach = distance_and_reach(cloud, neighbors, place, center)
         beside = place + small * reach[:, None] * tangents
         look = lambda place: _above(cloud, neighbors, degree, place, center, check=False)
-        (f, n, residual), (_, ns, _) = look(place), jax.vmap(look)(beside)
+        # Together: what is looked up is compiled once.
+        fs, ns, residuals = jax.vmap(look)(jnp.concatenate([place[None], beside]))
+        f, n, ns, residual = fs[0], ns[0], ns[1:], residuals[0]
         height = _along(points - f, n)
         off = points - f - height * n
         left = jnp.linalg.norm(off, axis=1)
@@ -261,7 +272,7 @@ def _feet(cloud, neighbors, points, nearest, degree: int) -> _Feet:
         good = residual < residual_tolerance(residual.dtype)
         most = jnp.where(good, jnp.finfo(f.dtype).eps ** 0.5 * reach, jnp.inf)
         left = jnp.where(least, left, jnp.linalg.norm(points - f, axis=1))
-        found = _Feet(place, center, left, most, distance, reach)
+        found = _Feet(place, center, left, most, distance, reach, residual, height[:, 0])
         done = (found.left <= most)[:, None]
         return found, jnp.where(done, place, f + step), count + 1
 
@@ -271,7 +282,7 @@ def _feet(cloud, neighbors, points, nearest, degree: int) -> _Feet:
 
     x = cloud.points[nearest]
     none = jnp.zeros_like(points[:, 0])
-    first = _Feet(points, nearest, none + jnp.inf, none, none, none)
+    first = _Feet(points, nearest, none + jnp.inf, *(none,) * 5)
     return jax.lax.while_loop(goes_on, nearer, (first, x, 0))[0]
 
 

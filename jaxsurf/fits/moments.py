@@ -242,9 +242,22 @@ def out_of_blocks(a: Shaped[Array, "blocks *s size"], n: int) -> Shaped[Array, "
     return a[..., :n]
 
 
-def blockwise(f: Callable, blocks):
+def blockwise(f: Callable, blocks, count=None):
     """`f` on one block after another: memory stays flat.
 
     In reverse mode each block is computed again from its inputs instead of being stored.
+
+    Args:
+        count: only so many of them, may be traced; not differentiable then. None: all.
     """
-    return jax.lax.map(jax.checkpoint(f), blocks)
+    if count is None:
+        return jax.lax.map(jax.checkpoint(f), blocks)
+    f = jax.jit(f)  # traced once
+    at, put_at = jax.lax.dynamic_index_in_dim, jax.lax.dynamic_update_index_in_dim
+    block = lambda i: jax.tree.map(lambda a: at(a, i, keepdims=False), blocks)
+    total = len(jax.tree.leaves(blocks)[0])
+    room = jax.tree.map(
+        lambda a: jnp.zeros((total, *a.shape), a.dtype), jax.eval_shape(lambda: f(block(0)))
+    )
+    put = lambda i, room: jax.tree.map(lambda r, a: put_at(r, a, i, 0), room, f(block(i)))
+    return jax.lax.fori_loop(0, count, put, room)

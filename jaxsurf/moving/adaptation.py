@@ -2,7 +2,6 @@ r"""Points added in holes and merged where they crowd, with fields on them."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from ..arguments import as_float, finite, flag, instance, real, switched_off, whole
+from ..compiling import on_device
 from ..discretization import Discretization, discretize
 from ..failures import needs_values, raise_at
 from ..interpolation import interpolated
@@ -21,8 +21,6 @@ from .rows import Rows, compact, exchanged
 
 # Each round fills the largest holes that do not touch, so the number of points may triple in it.
 _ROUNDS = 30
-# New points are interpolated in arrays of such sizes, times powers of two.
-_ROOM = 64
 
 
 class Adaptation(eqx.Module):
@@ -228,7 +226,7 @@ def _sought(surface: Discretization, rows: Rows, adaptation: Adaptation) -> _Sou
     feet, normals, wide = np.zeros((0, cloud.dim)), np.zeros((0, cloud.dim)), np.zeros(0)
     radius = adaptation.hole * spacing
     if border is not None and cloud.dim == 3:
-        feet, normals, wide = map(np.asarray, border_gaps(cloud, border, radius))
+        feet, normals, wide = border_gaps(cloud, border, radius)
     pairs = close_pairs(cloud, lists, adaptation.closest * spacing, rank)
     holes, size = fillings(cloud, lists, radius)
     wanted = np.concatenate([wide, size]) / adaptation.hole
@@ -247,11 +245,10 @@ def _placed(surface: Discretization, rows: Rows, found: _Sought) -> Rows:
     points, normals, fields = _interpolated(cloud, surface.neighbors, degree, at, arrays)
     points[edge], normals[edge] = found.feet, found.normals
     merged = np.minimum(*np.asarray(rows.spacing)[pairs].T)
-    spacing = jnp.asarray(np.concatenate([merged, found.spacing]), rows.spacing.dtype)
+    spacing = np.concatenate([merged, found.spacing]).astype(rows.spacing.dtype)
     ranks = np.zeros(len(at), rank.dtype)
     ranks[: len(pairs)], ranks[edge] = rank[pairs[:, 0]], 1
-    points, normals, fields = jax.tree.map(jnp.asarray, (points, normals, fields))
-    return Rows(points, normals, fields, spacing, jnp.asarray(ranks))
+    return Rows(*jax.tree.map(on_device, (points, normals, fields, spacing, ranks)))
 
 
 def conserved(before: Discretization, old, after: Discretization, new) -> PyTree[Array]:
@@ -268,16 +265,13 @@ def conserved(before: Discretization, old, after: Discretization, new) -> PyTree
 def _interpolated(cloud, neighbors, degree: int, at, arrays) -> PyTree[np.ndarray]:
     """Points, normals and fields at some places above the surface, in one go.
 
-    In arrays of few sizes, and in NumPy where their number counts: nothing is compiled for it.
+    In NumPy where their number counts: nothing is compiled for it.
     """
     leaves, structure = jax.tree.flatten(arrays)
-    together = jnp.concatenate([u.reshape(len(u), -1) for u in leaves], axis=1)
-    count = len(at)
-    room = _ROOM * 2 ** max(0, math.ceil(math.log2(count / _ROOM)))
-    padded = np.append(at, np.repeat(at[:1], room - count, axis=0), axis=0)
-    padded = jnp.asarray(padded, cloud.points.dtype)
-    found = np.array(interpolated(cloud, neighbors, degree, padded, together))[:count]
-    parts = np.split(found, np.cumsum([u[0].size for u in leaves])[:-1], axis=1)
+    together = np.concatenate([np.asarray(u).reshape(len(u), -1) for u in leaves], axis=1)
+    count, at = len(at), at.astype(cloud.points.dtype)
+    found = np.array(interpolated(cloud, neighbors, degree, on_device(at), on_device(together)))
+    parts = np.split(found, np.cumsum([u.size // len(u) for u in leaves])[:-1], axis=1)
     parts = [v.reshape(count, *u.shape[1:]).astype(u.dtype) for u, v in zip(leaves, parts)]
     points, normals, fields = jax.tree.unflatten(structure, parts)
     return points, normals / np.linalg.norm(normals, axis=1, keepdims=True), fields

@@ -223,9 +223,9 @@ class _Run:
             self.solver = solution.stats["solver"]
             left = reached - self.t > _LEAST * (target - self.t)
             if left and (
-                jnp.any(unreached(start, new[0], neighbors))
+                np.any(unreached(start, new[0], neighbors))
                 or self.may_cross(new[0])
-                or (uneven and jnp.any(_uneven(start, new[0], neighbors, _STRETCH**2)))
+                or (uneven and np.any(_uneven(start, new[0], neighbors, _STRETCH**2)))
             ):
                 # The last step went farther than the neighbours serve: half of the way first.
                 end = self.t + (reached - self.t) / 2

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from ..borders.border import Border
 from ..cloud import PointCloud
+from ..compiling import on_device
 from ..frames import frames_of
 from ..neighbors import Neighbors
 
 # Numbers held together: points times neighbours.
 _BATCH = 1 << 18
+# Gaps of a border that are treated together.
+_GAPS = 32
 # Of directions, and of a centre in its triangle: what round-off makes of even grids.
 _ROUNDOFF = 1e-6
 
@@ -118,7 +120,7 @@ def large_gaps(
 
 def border_gaps(
     cloud: PointCloud, border: Border, radius: Float[np.ndarray, " n"]
-) -> tuple[Float[Array, "m 3"], Float[Array, "m 3"], Float[np.ndarray, " m"]]:
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"], Float[np.ndarray, " m"]]:
     """Points of a border, normals and radii there, in its gaps.
 
     They are longer than the side of an equilateral triangle whose corners are on such a circle.
@@ -129,8 +131,31 @@ def border_gaps(
     ends = np.stack([rows[slot, own[slot]], rows[slot, own[slot] + 1]])
     x = np.asarray(cloud.points)[ends]
     wide = np.linalg.norm(x[1] - x[0], axis=1) > math.sqrt(3) * radius[ends].mean(axis=0)
-    foot, normal, *_ = border.at(cloud, 1, jnp.asarray(slot[wide]), jnp.asarray(x.mean(0)[wide]))
+    slot, near = slot[wide], x.mean(axis=0)[wide]
+    known = np.asarray(border.points)[slot], rows[slot], mask[slot], near
+    feet = [np.zeros((2, 0, 3))]
+    for first in range(0, len(slot), _GAPS):
+        feet.append(_on_border(cloud, *(a[first : first + _GAPS] for a in known)))
+    foot, normal = np.concatenate(feet, axis=1)
     return foot, normal, radius[ends].mean(axis=0)[wide]
+
+
+def _on_border(cloud, points, rows, mask, near) -> Float[np.ndarray, "2 m 3"]:
+    """Foot points on a border and normals there, of some gaps: on a border of nothing but these.
+
+    Filled up, so that what is compiled for it serves any number, and any border.
+    """
+    some = np.resize(np.arange(len(points)), _GAPS)
+    names = np.append(rows[some], points[some])
+    x, normals = np.asarray(cloud.points)[names], np.asarray(cloud.normals)[names]
+    own = np.arange(len(names), dtype=np.int32)
+    windows, ends = np.split(own, [rows[some].size])
+    arrays = ends, np.tile(windows.reshape(_GAPS, -1), (2, 1, 1)), np.tile(mask[some], (2, 1, 1))
+    alone = Border(*map(on_device, arrays))
+    cloud = PointCloud(on_device(x), on_device(normals))
+    slot = on_device(np.arange(_GAPS, dtype=np.int32))
+    foot, normal, *_ = alone.at(cloud, 1, slot, on_device(near[some]))
+    return np.stack([foot, normal])[:, : len(points)]
 
 
 def circumcenters(

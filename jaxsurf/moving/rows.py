@@ -7,13 +7,13 @@ import math
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..borders.border import Border
 from ..borders.order import find_border
 from ..cloud import PointCloud
+from ..compiling import on_device
 from ..discretization import Discretization
 from ..neighbors import Neighbors, find_neighbors
 
@@ -44,7 +44,7 @@ class Rows(NamedTuple):
             points = np.asarray(border.points)
             corners = border.corners if cloud.dim == 3 else np.ones(len(points), bool)
             rank[points] = 1 + corners
-        return cls(cloud.points, cloud.normals, fields, jnp.asarray(spacing), jnp.asarray(rank))
+        return cls(cloud.points, cloud.normals, fields, on_device(spacing), on_device(rank))
 
 
 def exchanged(
@@ -62,8 +62,8 @@ def exchanged(
     on[free] = True
     rows = jax.tree.map(functools.partial(_put, free, len(on)), rows, coming)
     held = surface.border is not None
-    marked = jnp.asarray((np.asarray(rows.rank) > 0) & on) if held else None
-    cloud = PointCloud(rows.points, rows.normals, active=jnp.asarray(on), boundary=marked)
+    marked = on_device((np.asarray(rows.rank) > 0) & on) if held else None
+    cloud = PointCloud(rows.points, rows.normals, active=on_device(on), boundary=marked)
     k = min(surface.method.neighbor_count(cloud.dim), int(on.sum()))
     neighbors = find_neighbors(cloud, k)
     neighbors = _widened(neighbors, surface.neighbors.k)
@@ -77,14 +77,14 @@ def compact(surface: Discretization, fields: PyTree[Array]) -> tuple[Discretizat
     on = np.flatnonzero(cloud.host_active)
     row = np.zeros(cloud.n, np.int32)
     row[on] = np.arange(len(on))
-    kept = lambda u: jnp.asarray(np.asarray(u)[on])
+    kept = lambda u: on_device(np.asarray(u)[on])
     marked = None if cloud.boundary is None else kept(cloud.boundary)
     border = surface.border
     if border is not None:
-        renamed = lambda names: jnp.asarray(row[np.asarray(names)])
+        renamed = lambda names: on_device(row[np.asarray(names)])
         border = Border(renamed(border.points), renamed(border.rows), border.mask)
     cloud = PointCloud(kept(cloud.points), kept(cloud.normals), boundary=marked)
-    lists = Neighbors(jnp.asarray(row[np.asarray(lists.indices)[on]]), kept(lists.mask))
+    lists = Neighbors(on_device(row[np.asarray(lists.indices)[on]]), kept(lists.mask))
     fields = jax.tree.map(kept, fields)
     return Discretization(cloud, lists, surface.method, border), fields
 
@@ -105,7 +105,7 @@ def _widened(lists: Neighbors, k: int) -> Neighbors:
     indices = np.where(
         np.pad(lists.mask, more), np.pad(lists.indices, more), np.arange(lists.n)[:, None]
     )
-    return Neighbors(jnp.asarray(indices.astype(np.int32)), jnp.asarray(np.pad(lists.mask, more)))
+    return Neighbors(on_device(indices.astype(np.int32)), on_device(np.pad(lists.mask, more)))
 
 
 def _put(rows: np.ndarray, count: int, old: Array, new: Array) -> Array:
@@ -117,4 +117,4 @@ def _put(rows: np.ndarray, count: int, old: Array, new: Array) -> Array:
     longer = np.broadcast_to(before[:1], (count - len(before), *before.shape[1:]))
     after = np.concatenate([before, longer])
     after[rows] = np.asarray(new)
-    return jnp.asarray(after)
+    return on_device(after)

@@ -25,8 +25,9 @@ from .gathers import constant_product, product, take
 
 # An entry added by a scatter costs about as much as this many padded slots.
 _SCATTER = 12
-# Room in the list of entries beyond the slots: this share of the rows, or 4, 16, ... times that.
-_LISTED = 1 / 8
+# Room in the list of entries beyond the slots: this share of the rows, but at least so many, or 4,
+# 16, ... times that. (In shorter lists a long row more would need another program.)
+_LISTED, _LEAST = 1 / 8, 32
 # Widths tried for a matrix of known usual width: that times powers of this, if not told otherwise.
 _STEP = 0.7
 # By how much another width has to be cheaper than the usual one: else the next surface, which has
@@ -105,7 +106,7 @@ def _slots(length: np.ndarray, m: int, width: float | None, step: float) -> tupl
     usual = None if width is None else math.ceil(width)
     for k in _widths(width, step):
         over = int(overflow[min(k, widest + 1)])
-        listed = max(math.ceil(m * _LISTED), 1)
+        listed = max(math.ceil(m * _LISTED), _LEAST)
         while listed < over:
             listed *= 4
         cost = (k * m + _SCATTER * listed) * (1 if k == usual else _CHEAPER)

@@ -195,13 +195,13 @@ def _finished(plan: Plan, run: Run, throw: bool) -> dfx.Solution:
         lambda s: (s.ts, s.ys, s.stats), solution, (ts, ys, stats), is_leaf=lambda x: x is None
     )
     results = (dfx.RESULTS.successful, dfx.RESULTS.event_occurred)
-    good = functools.reduce(operator.or_, (solution.result == r for r in results))
     if not plan.concrete:
+        good = functools.reduce(operator.or_, (solution.result == r for r in results))
         if not (throw and is_marking()):
             return solution
         ended = lambda y: refuse(y, ~good, "the end was not reached")
         return eqx.tree_at(lambda s: s.ys, solution, jax.tree.map(ended, solution.ys))
-    if good:
+    if any(bool(solution.result == r) for r in results):
         return solution
     if verdict is not None and not bool(verdict.stable):
         if throw:

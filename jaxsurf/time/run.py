@@ -10,6 +10,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, PyTree
 
@@ -210,12 +211,9 @@ def planned(
         )  # fmt: skip
         event = _ending(event, arrays, now, told)
     saveat = _saving(saveat, arrays, now)
-    size, growth = root_mean_square(constant(u0)), jnp.asarray(constant(problem._grows), t0.dtype)
-    # (Infinite times nothing would be no number.)
-    grown = jnp.where(jnp.isfinite(growth), jnp.exp(growth * jnp.abs(t1 - t0)), jnp.inf)
-    limit = jnp.where(size > 0, _GROWN * size * grown, jnp.where(jnp.isfinite(grown), 0, jnp.inf))
+    limit = _limit(*constant((u0, jnp.asarray(problem._grows, t0.dtype))), t0, t1)
     parts = (terms, solver, t0, t1, dt0, u0, args, controller, limit, saveat, event, adjoint)
-    concrete = is_concrete(parts, jnp.zeros(()) + 0)  # also not inside a `jit`
+    concrete = is_concrete(parts)  # also not inside a `jit`, which would make the limit traced
     _log.info("%s over [%s, %s] by %s", type(problem).__name__, t0, t1, why)
     throw = bool(throw) and not concrete and not is_marking()
     run = Run(*parts, allowed, bool(progress), throw)
@@ -292,6 +290,15 @@ def _looped(solver: RKC2, adjoint: dfx.AbstractAdjoint) -> RKC2:
 
 
 @jax.jit
+def _limit(u0, growth, t0: Array, t1: Array) -> Array:
+    """Size beyond which a state is none of the problem's."""
+    size = root_mean_square(u0)
+    # (Infinite times nothing would be no number.)
+    grown = jnp.where(jnp.isfinite(growth), jnp.exp(growth * jnp.abs(t1 - t0)), jnp.inf)
+    return jnp.where(size > 0, _GROWN * size * grown, jnp.where(jnp.isfinite(grown), 0, jnp.inf))
+
+
+@jax.jit
 def _shortest(t0: Array, t1: Array) -> Array:
     """A step that is not worth trying: much shorter than all, or lost in the time."""
     lost = 4 * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
@@ -313,7 +320,7 @@ def _allowed(max_steps, saveat: dfx.SaveAt, t0, t1, dt0, controller) -> int:
         max_steps = _STORED_STEPS if _stores_steps(saveat) else _MANY_STEPS
     adaptive = isinstance(controller, dfx.AbstractAdaptiveStepSizeController)
     if not given and dt0 is not None and not adaptive and is_concrete(t0, t1, dt0):
-        steps = float(jnp.abs((t1 - t0) / dt0))
+        steps = float(np.abs((np.asarray(t1) - np.asarray(t0)) / np.asarray(dt0)))
         if steps > max_steps + 1:
             raise ValueError(
                 f"dt0 = {float(dt0):g} makes {steps:.3g} steps from {float(t0):g} to "

@@ -96,7 +96,7 @@ def _completed(sizes, closed, neighbors):
     good = closed & (sizes > 0)
     counted = neighbors.mask & good[neighbors.indices]
     total = xp.sum(xp.where(counted, sizes[neighbors.indices], 0), axis=1)
-    mean = total / xp.maximum(xp.sum(counted, axis=1), 1)
+    mean = total / xp.maximum(xp.sum(counted, axis=1), 1).astype(total.dtype)
     on = neighbors.mask[:, 0]
     sizes = xp.where(good | ~on, sizes, mean)
     return sizes, on & ~(sizes > 0)

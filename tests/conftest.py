@@ -49,17 +49,6 @@ def quick_environment() -> dict[str, str]:
     return _optimised_little
 
 
-# Of files that start a command in each test, any worker may take any test.
-COMMANDS = ("test_experiments_run", "test_notebooks")
-
-
-def pytest_collection_modifyitems(items):
-    """Tests of another file share what they compile: one worker takes them all."""
-    for item in items:
-        if item.path.stem not in COMMANDS:
-            item.add_marker(pytest.mark.xdist_group(item.path.stem))
-
-
 # Files that test stencils in the form that runs faster, as users compile it in programs of theirs.
 THOROUGH = (
     "accuracy",

@@ -215,7 +215,7 @@ def test_derivatives(solver):
     )
     np.testing.assert_allclose(float(tangent()[1]), expected, rtol=1e-6)
 
-    n = 100
+    n = 200  # the look at stability keeps 51 pairs of vectors
     _, wide, _ = ring(n)
     inputs = (jnp.ones(n), wide.weights, *inputs[2:])
     dt0 = dt0 / 50

@@ -38,7 +38,7 @@ class Redistribution(AbstractMotion):
             operations of JAX; None: even everywhere.
 
     Accuracy: points stay on the surface to the tolerance of the steps and the error of the normals;
-        fields follow with the order of the gradient. In float32 points are within 1e-5
+        fields follow with the order of the gradient. In float32 points are within 1e-4
         (`tests/test_redistribution.py`).
     Differentiable: forward and reverse, as `evolve`.
     Raises:
@@ -94,7 +94,8 @@ def _away(surface: Discretization, size: Float[Array, " n"]) -> Float[Array, "n 
     r"""$-\nabla\rho / \rho$ along the surface, with $\rho(x) = \sum_j s_j W(|x - x_j| / R)$.
 
     Of Wendland's kernel $W(q) = (1 - q)^4 (4q + 1)$, $W' = -20 q (1 - q)^3$: its transform is
-    positive, so that displacements of every wave length die out, those of single points too.
+    positive, so that on a lattice displacements of every wave length die out. Points that are even
+    but no lattice first rearrange: some of their displacements grow, slowly, until they are one.
     """
     x, lists, normals = surface.cloud.points, surface.neighbors, surface.cloud.normals
     apart = x[:, None] - take(x, lists.indices)

@@ -198,14 +198,17 @@ def test_another_spacing_is_another_run(tmp_path):
 def test_points_are_added_while_a_sphere_grows(tmp_path, monkeypatch):
     """With room for all nothing compiles twice; a run that was killed ends in the same bits."""
     start = js.sphere(300)
-    adaptation = js.Adaptation(spacing=0.22, capacity=700)
 
-    def run(name):
+    def run(name, rate=0.5, spacing=0.22):
+        adaptation = js.Adaptation(spacing, capacity=700)
         given = dict(checkpoint=js.Checkpoint(tmp_path / name, every=0.5), saveat=[0.0, 0.4])
         given |= dict(fields=start.points[:, 2], adapt=adaptation, method=js.GFDM(degree=2))
-        return js.evolve(js.Motion(growing), start, t1=1.0, args=0.5, **given)
+        return js.evolve(js.Motion(growing), start, t1=1.0, args=rate, **given)
 
     whole = run("whole")
+    with count_compilations() as names:
+        larger = run("larger", 0.6, 0.21)
+    assert larger.clouds[-1].n > whole.clouds[-1].n and not names, names
     assert whole.clouds[0].n == 300 and whole.clouds[-1].n > 450
     for cloud, u, radius in zip(whole.clouds, whole.fields, (1.0, 1.2, 1.5)):
         np.testing.assert_allclose(np.linalg.norm(cloud.points, axis=1), radius, atol=2e-3)

@@ -211,6 +211,8 @@ def evolve(
             )
         _check_problem(checked_problem(problem(surface)), fields, surface.n)
         check_coefficients(problem(surface), t0, t1)
+    if concrete:
+        motion.check(t0, surface, fields, args)
     options = dict(solver=solver, dt0=dt0, rtol=rtol, atol=atol, args=args)
     moving, state = Moving.of(surface, motion, problem), joined(surface.cloud.points, fields)
     if checkpoint is not None:

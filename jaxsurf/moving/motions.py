@@ -55,6 +55,9 @@ class AbstractMotion(eqx.Module):
         """How they do, `(n, d)`, while fields stay where they are."""
         raise NotImplementedError
 
+    def check(self, t, surface: Discretization, fields: PyTree[Array], args) -> None:
+        """Raise what is seen to be wrong from numbers at the start of a run; nothing by default."""
+
     def __add__(self, other: AbstractMotion) -> AbstractMotion:
         return MotionSum(self._parts + other._parts) if _is_motion(other) else NotImplemented
 
@@ -131,6 +134,10 @@ class MotionSum(AbstractMotion):
         parts = [(factor, motion) for factor, motion in self.parts if motion.slides]
         each = [factor * motion.sliding(t, surface, fields, args) for factor, motion in parts]
         return sum(each[1:], each[0])
+
+    def check(self, t, surface, fields, args):
+        for _, motion in self.parts:
+            motion.check(t, surface, fields, args)
 
     def __repr__(self):
         number = lambda x: f"{float(x):g}" if is_concrete(x) else "traced"

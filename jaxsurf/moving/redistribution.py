@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..arguments import as_float, real, switched_off, traced_call
 from ..discretization import Discretization
+from ..failures import refuse
 from ..stencils.gathers import take
 from .motions import AbstractMotion
 
@@ -44,7 +45,7 @@ class Redistribution(AbstractMotion):
     Raises:
         TypeError: a diffusivity that is no number, a spacing that is no function.
         ValueError: a diffusivity that is not positive; when it is used, a surface with a border, a
-            spacing of another shape.
+            spacing of another shape, or not positive (named by index where a run starts).
     Source: shifts of particles after Xu, Stansby and Laurence 2009, J. Comput. Phys. 228, 6703, and
         Lind, Xu, Stansby and Rogers 2012, J. Comput. Phys. 231, 1499, here along a surface.
 
@@ -81,12 +82,20 @@ class Redistribution(AbstractMotion):
         return jnp.zeros_like(surface.cloud.points)
 
     def sliding(self, t, surface, fields, args):
-        size = jnp.ones(surface.n, surface.cloud.points.dtype)
-        if self.spacing is not None:
-            wanted = traced_call(self.spacing, "spacing", t, surface, fields, args)
-            wanted = as_float(wanted, "spacing", (surface.n,), ())
-            size = size * wanted ** (surface.cloud.dim - 1)
-        return self.diffusivity * _away(surface, switched_off(surface.cloud.active, size, 1.0))
+        size = self._wanted(t, surface, fields, args) ** (surface.cloud.dim - 1)
+        return self.diffusivity * _away(surface, size)
+
+    def check(self, t, surface, fields, args):
+        self._wanted(t, surface, fields, args)
+
+    def _wanted(self, t, surface, fields, args) -> Float[Array, " n"]:
+        one = jnp.ones(surface.n, surface.cloud.points.dtype)
+        if self.spacing is None:
+            return one
+        h = traced_call(self.spacing, "spacing", t, surface, fields, args)
+        h = switched_off(surface.cloud.active, one * as_float(h, "spacing", (surface.n,), ()), 1.0)
+        bad = ~(jnp.isfinite(h) & (h > 0))
+        return refuse(h, bad, "the spacing wanted at point {i} is {v}, expected above 0", h)
 
 
 @jax.jit

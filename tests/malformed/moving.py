@@ -99,6 +99,8 @@ CALLS = [
     ("Redistribution", "a spacing that is a number", lambda: js.Redistribution(1.0, 0.1), ("spacing", "float", "function")),
     ("Redistribution", "on a surface with a border", lambda: js.evolve(js.Redistribution(1.0), bordered(), t1=0.01), ("border",)),
     ("Redistribution", "a spacing for others", lambda: evolve(js.Redistribution(1.0, lambda t, s, f, a: jnp.ones(70))), ("spacing", "(70,)", "60")),
+    ("Redistribution", "a spacing below nothing", lambda: evolve(js.Redistribution(1.0, lambda t, s, f, a: -s.cloud.points[:, 0] ** 2)), ("spacing", "point", "above 0")),
+    ("Redistribution", "a spacing without value", lambda: evolve(js.MeanCurvatureFlow() + js.Redistribution(1.0, lambda t, s, f, a: jnp.nan)), ("spacing", "point 0", "nan", "above 0")),
     ("evolve", "a motion plus a number", lambda: evolve(js.WillmoreFlow() + 0.1), ("WillmoreFlow", "float")),
     ("evolve", "a save alone", lambda: evolve(saveat=0.5), ("saveat is a float", "sequence of times")),
     ("evolve", "saves of diffrax", lambda: evolve(saveat=dfx.SaveAt(ts=[0.5])), ("saveat is a SaveAt", "sequence of times")),

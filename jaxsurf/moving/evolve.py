@@ -198,8 +198,9 @@ def evolve(
     on = surface.cloud.active
     field = lambda u: finite(switched_off(on, as_float(u, "fields", (n, ...))), "fields")
     fields = jax.tree.map(field, fields)
+    _check_types(fields, surface.cloud.points)
     concrete = is_concrete(surface, fields, args, t0, t1, motion)
-    looked = {"adapt": adapt, "contact": contact, "checkpoint": checkpoint}
+    looked: dict[str, Any] = {"adapt": adapt, "contact": contact, "checkpoint": checkpoint}
     if not concrete:
         _refuse_looks(looked)
     if contact is not None and checked_contact(contact).deletes and adapt is None:
@@ -222,11 +223,19 @@ def evolve(
     if concrete:
         try:
             return Evolution(
-                *followed(moving, state, t0, times, options, **looked, progress=progress)
+                *followed(moving, state, t0, times, options, adapt, contact, checkpoint, progress)
             )
         except ClosesOverTraced:
             _refuse_looks(looked)
     return _kept(moving, state, t0, times, options)
+
+
+def _check_types(fields, points) -> None:
+    for u in jax.tree.leaves(fields):
+        if u.dtype != points.dtype:
+            raise TypeError(
+                f"fields are {u.dtype}, points {points.dtype}: one state holds both, of one type"
+            )
 
 
 def _refuse_looks(looked: dict[str, Any]) -> None:

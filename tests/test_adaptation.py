@@ -237,6 +237,36 @@ def test_points_are_added_while_a_sphere_grows(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("saveat", [None, [i / 10 for i in range(1, 10)]], ids=["end", "many"])
+def test_points_follow_a_spacing_that_changes_however_often_is_saved(saveat):
+    """Nothing moves: only looks at given times can tell, also where times to save coincide."""
+    still = js.Motion(lambda t, surface, fields, args: 0 * surface.cloud.points)
+    wanted = lambda t, surface, fields, args: 0.16 - 0.1 * t + 0 * surface.cloud.points[:, 0]
+    adapt = js.Adaptation(wanted, every=0.2, capacity=100)
+    given = dict(method=js.GFDM(degree=2), saveat=saveat)
+    run = js.evolve(still, js.circle(40), t1=1.0, adapt=adapt, **given)
+    np.testing.assert_allclose(run.events["t"], [0.8], rtol=1e-12)
+    assert run.clouds[-1].n == 80
+
+
+@pytest.mark.slow
+def test_a_corner_has_no_gap_that_no_point_fills():
+    """Two circles that grow and join: what encloses both, but for what is rounded off."""
+    distance, end = 2.6, 0.92
+    angle = 2 * np.pi * np.arange(60) / 60
+    x = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    both = js.PointCloud(np.concatenate([x, x + np.array([distance, 0])]), np.concatenate([x, x]))
+    given = dict(adapt=js.Adaptation(0.11, every=0.1, capacity=400), contact=js.Contact(0.3))
+    grow = js.Motion(lambda t, surface, fields, args: 0.5 * surface.cloud.normals)
+    run = js.evolve(grow, both, t1=end, method=js.GFDM(degree=2), **given)
+    radius = 1 + end / 2
+    half = np.arccos(distance / 2 / radius)
+    area = 2 * radius**2 * (np.pi - half + np.sin(half) * np.cos(half))
+    assert run.events["joined"].sum() == 1
+    assert abs(run.history["volume"][-1] - area) < 0.02 * area
+
+
+@pytest.mark.slow
 def test_no_step_goes_far_beyond_what_the_points_serve():
     """Steps as long as tolerances allow: the first would have doubled the sphere and more."""
     grow = js.Motion(lambda t, surface, fields, args: surface.cloud.points)
@@ -266,6 +296,14 @@ def test_an_error_says_how_many_points_are_needed():
     surface = js.discretize(js.sphere(200), method=js.GFDM(degree=2))
     with pytest.raises(ValueError, match=r"needs \d+ points, the capacity is 250"):
         js.adapt_points(surface, js.Adaptation(spacing=0.1, capacity=250))
+
+
+@pytest.mark.slow
+def test_an_error_on_the_way_says_when():
+    given = dict(adapt=js.Adaptation(0.16, capacity=60), method=js.GFDM(degree=2))
+    grow = js.Motion(lambda t, surface, fields, args: surface.cloud.normals)
+    with pytest.raises(ValueError, match=r"^at t = 1\.\d+: .* needs 80 points, the capacity is 60"):
+        js.evolve(grow, js.circle(40), t1=2.0, **given)
 
 
 @pytest.mark.slow

@@ -146,6 +146,18 @@ def test_parts_vanish_and_a_run_ends_with_the_last():
 
 
 @pytest.mark.slow
+def test_a_run_may_end_before_anything_was_saved():
+    """A circle is as thick as the distance, or 1.2 times so, when its radius is 0.3 or 0.25."""
+    inward = js.Motion(lambda t, surface, fields, args: -surface.cloud.normals)
+    given = dict(adapt=js.Adaptation(0.16, capacity=60), contact=js.Contact(0.5))
+    run = js.evolve(inward, js.circle(40), t1=2.0, method=js.GFDM(degree=2), **given)
+    assert "nothing was left" in repr(run) and not run.clouds
+    history = run.history
+    assert all(history[name].shape == (0,) for name in ("t", "n", "area", "volume", "mass"))
+    assert history["events"]["vanished"].sum() == 1 and 0.7 < history["events"]["t"][-1] < 0.75
+
+
+@pytest.mark.slow
 def test_a_waist_that_is_squeezed_pinches_off(tmp_path, monkeypatch):
     """And a run that was killed ends in the same bits."""
     start = with_a_waist(0.28, 0.1)

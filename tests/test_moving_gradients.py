@@ -96,3 +96,16 @@ def test_across_points_added():
     assert abs(float(slope) / difference(lambda rate: run(rate)[0], at) - 1) < 1e-5
     assert abs(float(value / exact(at)) - 1) < 2e-3
     assert abs(float(slope / jax.grad(exact)(at)) - 1) < 2e-3
+
+
+def test_what_functions_close_over_is_differentiated_too():
+    r"""A circle of radius $1 + a t$, by a factor of a motion and by what a velocity closes over."""
+    surface = js.discretize(js.circle(40), method=js.GFDM(degree=2))
+    outward = lambda t, surface, *_: surface.cloud.normals
+    end = lambda motion, **given: js.evolve(motion, surface, t1=0.1, **given).clouds[-1].points
+    factor = lambda a: end(a * js.Motion(outward), **STEPS)[0, 0]
+    closed = lambda a, **given: end(js.Motion(lambda *s: a * outward(*s)), **STEPS, **given)[0, 0]
+    for f in (factor, closed):
+        np.testing.assert_allclose(jax.value_and_grad(f)(1.0), [1.1, 0.1], rtol=1e-9)
+    with pytest.raises(ValueError, match="adapt needs concrete arrays"):
+        jax.grad(lambda a: closed(a, adapt=js.Adaptation(0.16)))(1.0)

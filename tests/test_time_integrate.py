@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import jaxsurf as js
+from jaxsurf.time.guard import Guard, guarded
 
 from .helpers import count_compilations, ring
 
@@ -120,6 +121,15 @@ def test_explosion_keeps_the_last_good_state():
     assert bool(jnp.all(jnp.isfinite(error.state))) and float(error.state.max()) > 100
     assert error.solution.result == dfx.RESULTS.dt_min_reached
     assert "steps were accepted" in str(error) and "RKC2" in str(error)
+
+
+def test_an_infinite_trial_is_followed_by_a_shorter_step():
+    """Infinite errors by infinite values are no number, nor would any step that follows be."""
+    controller = guarded(dfx.PIDController(1e-5, 1e-7), Guard(jnp.array(jnp.inf), jnp.array(False)))
+    y, infinite = jnp.ones(2), jnp.array([jnp.inf, 0.0])
+    start = (jnp.array(1.0), jnp.array(1.0), False)
+    kept, _, end, *_ = controller.adapt_step_size(0.0, 1.0, y, infinite, None, infinite, 5.0, start)
+    assert not kept and 0 < end < 1
 
 
 @pytest.mark.parametrize(

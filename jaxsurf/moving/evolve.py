@@ -28,7 +28,7 @@ from ..time.integrate import integrate
 from ..time.problem import AbstractEvolution, checked_problem
 from .adaptation import Adaptation, checked_adaptation
 from .contact import Contact, checked_contact
-from .follow import followed
+from .follow import ClosesOverTraced, followed
 from .motions import AbstractMotion, checked_motion
 from .problem import Moving, joined, parted
 from .rows import compact
@@ -91,13 +91,17 @@ class Evolution(eqx.Module):
         Raises what `areas` does.
         """
         rows = [_measured(*row) for row in self.rows]
-        history = {"t": self.ts} | jax.tree.map(lambda *values: jnp.stack(values), *rows)
+        none = dict.fromkeys(("n", "area", "volume", "mass"), jnp.zeros(0))
+        told = jax.tree.map(lambda *values: jnp.stack(values), *rows) if rows else none
+        history = {"t": self.ts} | told
         return history if self.changes is None else history | {"events": self.events}
 
     def __repr__(self):
         if not is_concrete(self.ts):
             return "Evolution(traced)"
         steps = ", ".join(f"{name} {value}" for name, value in self.stats.items())
+        if not len(self.ts):
+            return f"Evolution(no times: nothing was left of the surface at the first, {steps})"
         first, last = float(self.ts[0]), float(self.ts[-1])
         return (
             f"Evolution({len(self.surfaces)} times from {first:g} to {last:g}, "
@@ -194,10 +198,11 @@ def evolve(
     on = surface.cloud.active
     field = lambda u: finite(switched_off(on, as_float(u, "fields", (n, ...))), "fields")
     fields = jax.tree.map(field, fields)
-    concrete = is_concrete(surface, fields, args, t0, t1)
-    for name, value in (("adapt", adapt), ("contact", contact), ("checkpoint", checkpoint)):
-        if value is not None and not concrete:
-            raise ValueError(f"{name} needs concrete arrays: it is the host that looks at them")
+    _check_types(fields, surface.cloud.points)
+    concrete = is_concrete(surface, fields, args, t0, t1, motion)
+    looked: dict[str, Any] = {"adapt": adapt, "contact": contact, "checkpoint": checkpoint}
+    if not concrete:
+        _refuse_looks(looked)
     if contact is not None and checked_contact(contact).deletes and adapt is None:
         raise ValueError("contact of kind 'delete' needs adapt: new parts are filled with points")
     if adapt is not None:
@@ -218,10 +223,27 @@ def evolve(
     if checkpoint is not None:
         instance(checkpoint, Checkpoint, "checkpoint", "js.Checkpoint(path, every=...)")
     if concrete:
-        return Evolution(
-            *followed(moving, state, t0, times, options, adapt, contact, checkpoint, progress)
-        )
+        try:
+            return Evolution(
+                *followed(moving, state, t0, times, options, adapt, contact, checkpoint, progress)
+            )
+        except ClosesOverTraced:
+            _refuse_looks(looked)
     return _kept(moving, state, t0, times, options)
+
+
+def _check_types(fields, points) -> None:
+    for u in jax.tree.leaves(fields):
+        if u.dtype != points.dtype:
+            raise TypeError(
+                f"fields are {u.dtype}, points {points.dtype}: one state holds both, of one type"
+            )
+
+
+def _refuse_looks(looked: dict[str, Any]) -> None:
+    for name, value in looked.items():
+        if value is not None:
+            raise ValueError(f"{name} needs concrete arrays: it is the host that looks at them")
 
 
 def _check_problem(made: AbstractEvolution, fields, n: int) -> None:

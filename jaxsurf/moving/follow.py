@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from ..arguments import is_array
 from ..discretization import Discretization, discretize
+from ..failures import is_concrete
 from ..functions import canonical
 from ..motion import stretch, unreached
 from ..neighbors import Neighbors
@@ -42,6 +43,12 @@ _ROOM = 2.0
 _PAST = 0.05
 # Of the way that is left; a surface that cannot be followed this far is an error.
 _LEAST = 1e-6
+# Looks at points are due early by this share of the time between them: round-off makes none.
+_EARLY = 0.01
+
+
+class ClosesOverTraced(Exception):
+    """What a function closes over is being differentiated or compiled: nobody can look at it."""
 
 
 class _Place(NamedTuple):
@@ -165,7 +172,7 @@ class _Run:
     """A run under way: points, fields and lists now, and what it took to come here."""
 
     def __init__(self, moving: Moving, state, t, options, adapt, contact):
-        self.moving, self.state, self.t = moving, state, t
+        self.moving, self.state, self.t, self.start = moving, state, t, t
         self.options, self.solver, self.gone = options, "", False
         self.adapt: Adaptation | None = adapt
         self.contact: Contact | None = contact
@@ -209,10 +216,10 @@ class _Run:
 
     def to(self, target) -> None:
         """To a later time, with neighbours found anew and points adapted on the way."""
-        every = np.inf if self.adapt is None or self.adapt.every is None else self.adapt.every
         end = target
         while float(self.t) < float(target) and not self.gone:
-            end = min(end, self.t + every, self.next_look())
+            due = self.next_change()
+            end = min(end, due, self.next_look())
             surface, neighbors = self.moving.surface, self.moving.surface.neighbors
             start, uneven = surface.cloud.points, self.adapt is not None
             event = dfx.Event(_Worn(start, neighbors, self.free, uneven))
@@ -234,7 +241,8 @@ class _Run:
             self.count(steps, refused, 0)
             self.t, self.state, end = reached, new, target
             self.tell(reached)
-            if solution.result == dfx.RESULTS.event_occurred or float(reached) < float(target):
+            ended = solution.result == dfx.RESULTS.event_occurred or float(reached) < float(target)
+            if ended or float(reached) >= float(due):
                 self.renew()
 
     def stretch(self, end, event: dfx.Event) -> tuple[dfx.Solution, Any, tuple]:
@@ -248,13 +256,23 @@ class _Run:
                 raise
             return error.solution, np.asarray(error.time, self.t.dtype), error.state
         assert solution.ts is not None and solution.ys is not None
+        _seen(solution.ys)
         return solution, solution.ts[-1], jax.tree.map(lambda y: y[-1], solution.ys)
+
+    def next_change(self):
+        """When points are looked at whatever they have done: at multiples of a time from the start,
+        so that neither what is saved nor parts put it off."""
+        if self.adapt is None or self.adapt.every is None:
+            return np.inf
+        every = self.adapt.every
+        passed = np.floor(float(self.t - self.start) / every + _EARLY)
+        return self.start + np.asarray((passed + 1) * every, self.start.dtype)
 
     def next_look(self) -> float:
         """When sheets are to be looked at again, at the speed that they have now."""
         if self.contact is None or self.free is None:
             return np.inf
-        velocity = _velocity(self.moving, self.t, self.state, self.options["args"])
+        velocity = _seen(_velocity(self.moving, self.t, self.state, self.options["args"]))
         speed = np.linalg.norm(np.asarray(velocity, float), axis=1)
         limit = np.asarray(self.free, float) + _PAST / 2 * float(self.contact.distance)
         return float(self.t) + np.min(limit / np.maximum(speed, np.finfo(float).tiny))
@@ -270,14 +288,23 @@ class _Run:
     def renew(self) -> None:
         """Normals and neighbours found anew, and points changed."""
         surface, cloud = self.moving.surface, self.moving.cloud_at(self.state[0])
-        normals = fitted_normals(surface, cloud.points, cloud.normals)
-        cloud = eqx.tree_at(lambda c: c.normals, cloud, normals)
-        if self.search is None:
-            self.search = self.room(surface)
-        surface = Discretization(cloud, surface.neighbors, surface.method, surface.border)
-        self.count(0, 0, 1)
-        if self.adapt is None or not self.change(surface):
-            self.begin(surface)
+        with self.when():
+            normals = fitted_normals(surface, cloud.points, cloud.normals)
+            cloud = eqx.tree_at(lambda c: c.normals, cloud, normals)
+            if self.search is None:
+                self.search = self.room(surface)
+            surface = Discretization(cloud, surface.neighbors, surface.method, surface.border)
+            self.count(0, 0, 1)
+            if self.adapt is None or not self.change(surface):
+                self.begin(surface)
+
+    @contextlib.contextmanager
+    def when(self):
+        """An error says at what time."""
+        try:
+            yield
+        except ValueError as error:
+            raise ValueError(f"at t = {float(self.t):g}: {error}") from error
 
     def room(self, surface: Discretization) -> NeighborSearch:
         """To find neighbours in, of points that may come to be denser."""
@@ -294,9 +321,7 @@ class _Run:
             try:
                 found = discretize(cloud, method=surface.method)
             except ValueError as error:
-                raise ValueError(
-                    f"at t = {float(self.t):g} neighbours could not be found anew: {error}"
-                ) from error
+                raise ValueError(f"neighbours could not be found anew: {error}") from error
             self.search = self.room(found)
         self.moving = Moving.of(found, self.moving.motion, self.moving.on)
         self.watch()
@@ -331,6 +356,13 @@ class _Run:
         if any(count):
             self.changes = np.append(self.changes, [[float(self.t), *count]], axis=0)
         return any(count)
+
+
+def _seen(tree):
+    """Arrays that can be looked at."""
+    if not is_concrete(tree):
+        raise ClosesOverTraced
+    return tree
 
 
 @eqx.filter_jit

@@ -199,6 +199,10 @@ def fillings(
         around, at = around[inside], at[inside]
     x = np.asarray(cloud.points, float)[cloud.host_active]
     size, wanted = cKDTree(x).query(at)[0], radius[around].mean(axis=1)
+    if cloud.dim == 2:
+        # Past a sharp corner what comes next along the tangent may be far, and filled between.
+        empty = size >= wanted * (1 - _ROUNDOFF)
+        at, size, wanted = at[empty], size[empty], wanted[empty]
     # The largest first: the middle of a hole, not a smaller circle at its rim. A centre above the
     # surface may be nearer to others than to those that it was found from.
     order = np.argsort(-size / wanted, kind="stable")

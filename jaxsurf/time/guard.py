@@ -33,8 +33,9 @@ class Guard(eqx.Module):
 class Guarded(dfx.AbstractStepSizeController):
     """A controller that stops with a result code, the state before as the last, where `guard` says.
 
-    An adaptive controller refuses steps with infinite entries by itself, and tries shorter ones:
-    only what it would accept is looked at.
+    An adaptive controller refuses steps with entries that are no numbers by itself, and tries
+    shorter ones: only what it would accept is looked at. (Of infinite ones it would make steps of a
+    length that is no number, for ever.)
     """
 
     controller: dfx.AbstractStepSizeController
@@ -47,8 +48,10 @@ class Guarded(dfx.AbstractStepSizeController):
         return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state):
+        numbers = lambda y: jnp.where(jnp.isfinite(y), y, jnp.nan)
+        tried = jax.tree.map(numbers, y1_candidate)
         keep, start, end, jump, new_state, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, state
+            t0, t1, y0, tried, args, y_error, error_order, state
         )
         stop = keep & self.guard.stops(y1_candidate) | self.guard.refused
         result = dfx.RESULTS.where(stop, dfx.RESULTS.nonlinear_divergence, result)

@@ -50,6 +50,7 @@ CALLS = [
     ("evolve", "fields of others", lambda: evolve(fields=jnp.ones(70)), ("fields", "(70,)", "60")),
     ("evolve", "a field that is not finite", lambda: evolve(fields=jnp.ones(N).at[7].set(np.nan)), ("fields", "7")),
     ("evolve", "a complex field", lambda: evolve(fields=1j * jnp.ones(N)), ("fields", "complex")),
+    ("evolve", "a field of another type", lambda: evolve(fields=jnp.ones(N, jnp.float16)), ("fields", "float16", "points")),
     ("evolve", "a problem in place of a function", lambda: evolve(fields=jnp.ones(N), problem=heat(surface())), ("problem", "function", "surface")),
     ("evolve", "a function of no problem", lambda: evolve(fields=jnp.ones(N), problem=lambda s: s.laplacian), ("problem", "Stencil")),
     ("evolve", "an end before the start", lambda: evolve(t1=-1.0), ("t1", "-1", "0")),

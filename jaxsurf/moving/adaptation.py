@@ -146,7 +146,7 @@ def adapt_points(
     Raises:
         TypeError: arguments of other kinds.
         ValueError: a traced surface; fields of another shape or not finite; more points than the
-            capacity; holes that are left after 30 rounds.
+            capacity, or too few to fit polynomials; holes that are left after 30 rounds.
     Source: as `Adaptation`.
 
     Example:
@@ -195,7 +195,14 @@ def changed(
         if not len(pairs) + new:
             return surface, rows.fields, added, merged
         added, merged = added + new, merged + len(pairs)
-        coming = _placed(surface, rows, found)
+        try:
+            coming = _placed(surface, rows, found)
+        except ValueError as error:
+            left = int(surface.cloud.host_active.sum())
+            raise ValueError(
+                f"no points can be added or merged where {left} are left: the spacing wanted may "
+                f"be too large for the surface and the degree of its method ({error})"
+            ) from error
         surface, rows = exchanged(surface, rows, pairs.ravel(), coming, adaptation.capacity)
     raise ValueError(
         f"{new} holes and {len(pairs)} crowded pairs of points are left after {_ROUNDS} "

@@ -109,6 +109,7 @@ CALLS = [
     ("evolve", "a problem of others", lambda: evolve(fields=jnp.ones(N), problem=lambda s: heat(js.discretize(js.sphere(70), method=js.GFDM(degree=2)))), ("problem", "70", "60")),
     ("evolve", "a wave of one field", lambda: evolve(fields=jnp.ones(N), problem=lambda s: js.WaveEquation(s.laplacian)), ("fields", "2 arrays")),
     ("evolve", "a velocity in NumPy", lambda: evolve(js.Motion(lambda t, s, f, a: np.sin(np.asarray(s.cloud.points)))), ("velocity", "jax.numpy")),
+    ("adapt_points", "a spacing as large as the surface", lambda: js.adapt_points(surface(), js.Adaptation(3.0)), ("spacing", "are left", "too large", "polynomial")),
     ("Adaptation", "one for true", lambda: js.Adaptation(0.1, conserve=1), ("conserve is 1", "True or False")),
     ("MeanCurvatureFlow", "text for true", lambda: js.MeanCurvatureFlow("no"), ("keep_volume is 'no'", "True or False")),
 ]  # fmt: skip

@@ -169,6 +169,28 @@ def test_waves_are_diluted_in_their_velocity():
     assert float(jnp.linalg.norm(end.fields[-1][0] - u) / jnp.linalg.norm(u)) < 2e-2
 
 
+def test_waves_on_a_border_that_moves_have_the_velocity_of_what_they_are_given_there():
+    """Values that ride on the rim of a bowl that grows change with its place, too."""
+    root, t = 6**0.5, 0.7
+    bowl = js.surface_of_revolution(
+        lambda s: (jnp.sin(s), -jnp.cos(s)), 200, interval=(0, np.pi / 2)
+    )
+    rim = np.flatnonzero(bowl.boundary)
+
+    def problem(surface):
+        x, y, _ = surface.cloud.points[rim].T
+        given = js.dirichlet(rim, lambda t: jnp.sin(root * t) * x * y)
+        return js.WaveEquation(surface.laplacian, closure=js.eliminate(surface.cloud, given))
+
+    moving = Moving.of(js.discretize(bowl, method=SURFACE.method), js.Motion(growing), problem)
+    product = bowl.points[:, 0] * bowl.points[:, 1]
+    sine, cosine = np.sin(root * t), np.cos(root * t)
+    exact = sine * product, (root * cosine + 2 * RATE * sine) * product
+    state = bowl.points, tuple(jnp.where(bowl.boundary, 7.0, u) for u in exact)
+    for found, wanted in zip(moving.fields(t, state, RATE), exact):
+        np.testing.assert_allclose(found, wanted, atol=1e-12)
+
+
 @pytest.mark.slow
 def test_derivatives_through_the_motion():
     """In rate, points and fields, against differences: all in one program."""

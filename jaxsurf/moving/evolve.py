@@ -296,7 +296,8 @@ def _kept(moving: Moving, state, t, times, options) -> Evolution:
         # Whatever is looked at of it, fields alone or points.
         kept = functools.partial(refuse, bad=jnp.any(code > 0), message=text)
         state = jax.tree.map(kept, state)
-        rows.append((moving.surface_at(parted(state)[0]), moving.fields(target, state)))
+        fields = moving.fields(target, state, options["args"])
+        rows.append((moving.surface_at(parted(state)[0]), fields))
     return Evolution(jnp.stack([jnp.asarray(s) for s in times]), rows, {})
 
 

@@ -201,7 +201,7 @@ class _Run:
         surface = self.moving.surface_at(self.state[0])
         # What was wrong with it would have been an error.
         surface = eqx.tree_at(lambda s: s.found, surface, None, is_leaf=lambda x: x is None)
-        fields = self.moving.fields(self.t, self.state)
+        fields = self.moving.fields(self.t, self.state, self.options["args"])
         return _Place(surface, joined(self.state[0], fields))
 
     def count(self, steps: int, refused: int, renewals: int) -> None:

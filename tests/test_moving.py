@@ -289,6 +289,14 @@ def test_heat_stays_within_borders_that_move_with_it():
     assert abs(mass[1] / mass[0] - 1) < 1e-2
 
 
+def test_progress_bar(capfd):
+    """In units of t, in few digits: 0.1 + 0.2 is 0.30000000000000004."""
+    drift = js.Motion(lambda t, surface, fields, args: 0 * surface.cloud.normals)
+    js.evolve(drift, js.circle(60), t1=0.1 + 0.2, saveat=[0.1], progress=True)
+    told = capfd.readouterr().err
+    assert "t = 0.3 of 0.3" in told and "0000" not in told
+
+
 def test_where_a_surface_has_no_areas_a_step_is_refused_not_an_error():
     """A step that is tried may tear it: the rate is then no number, by which steps are refused."""
     surface = js.discretize(js.sphere(200), method=js.GFDM(degree=2))

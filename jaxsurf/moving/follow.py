@@ -40,6 +40,8 @@ _ROOM = 2.0
 # Sheets that approach are looked at before a step has taken them nearer by this share of the
 # distance at which they touch.
 _PAST = 0.05
+# In units of t, which are no whole numbers.
+_BAR = "t = {n:.4g} of {total:.4g} |{bar}| {percentage:3.0f}% [{elapsed}<{remaining}]"
 # Of the way that is left; a surface that cannot be followed this far is an error.
 _LEAST = 1e-6
 
@@ -101,7 +103,7 @@ def followed(
         run.change(run.moving.surface)
         now = now._replace(place=run.place, changes=run.changes)
     saved = list(now.saved)
-    with tqdm(total=float(times[-1] - start), disable=not progress, unit="t") as bar:
+    with tqdm(total=float(times[-1] - start), disable=not progress, bar_format=_BAR) as bar:
         run.tell = lambda t: bar.update(float(t - start) - bar.n)
         for part in range(int(now.part), len(ends)):
             t, end = ends[part - 1] if part else start, ends[part]

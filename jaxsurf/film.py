@@ -149,7 +149,8 @@ def _writer(path: Path, fps: float):
         """All pictures in the same 256 colours: else each has its own, and the bar flickers."""
 
         def finish(self):
-            self._frames = in_same_colors(self._frames)
+            pictures = vars(self)["_frames"]
+            pictures[:] = in_same_colors(pictures)
             super().finish()
 
     kinds: dict[str, Any] = {".gif": Gif, ".mp4": FFMpegWriter}

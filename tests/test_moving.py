@@ -180,7 +180,7 @@ def test_waves_on_a_border_that_moves_have_the_velocity_of_what_they_are_given_t
     def problem(surface):
         x, y, _ = surface.cloud.points[rim].T
         given = js.dirichlet(rim, lambda t: jnp.sin(root * t) * x * y)
-        return js.WaveEquation(surface.laplacian, closure=js.eliminate(surface.cloud, given))
+        return js.WaveEquation(surface.laplacian, closure=js.eliminate(surface, given))
 
     moving = Moving.of(js.discretize(bowl, method=SURFACE.method), js.Motion(growing), problem)
     product = bowl.points[:, 0] * bowl.points[:, 1]
@@ -287,6 +287,37 @@ def test_heat_stays_within_borders_that_move_with_it():
     assert jnp.abs(phi - 1.5**-0.5).max() < 1e-2
     mass = run.history["mass"]
     assert abs(mass[1] / mass[0] - 1) < 1e-2
+
+
+def test_conditions_of_a_surface_also_where_it_is_traced():
+    """Its neighbours and border are taken, which nothing can search for there."""
+    bowl = js.surface_of_revolution(
+        lambda s: (jnp.sin(s), -jnp.cos(s)), 200, interval=(0, np.pi / 2)
+    )
+    rim, product = np.flatnonzero(bowl.boundary), bowl.points[:, 0] * bowl.points[:, 1]
+
+    def filled(scale):
+        moved = js.discretize(bowl, method=SURFACE.method).moved(scale * bowl.points)
+        # Nothing of x y leaves through the rim, where z = 0.
+        flux = js.robin(rim, a=1.0, b=1.0, value=product[rim])
+        return js.eliminate(moved, flux)(jnp.where(bowl.boundary, 0, product))
+
+    for scale in (1.0, 1.5):
+        found = jax.jit(filled)(scale)
+        np.testing.assert_allclose(found, filled(scale), atol=1e-9)
+        np.testing.assert_allclose(found, product, atol=5e-3)
+
+
+def test_a_flow_of_a_border_is_refused_for_what_it_is():
+    bowl = js.surface_of_revolution(
+        lambda s: (jnp.sin(s), -jnp.cos(s)), 200, interval=(0, np.pi / 2)
+    )
+    heat = lambda s: js.AdvectionDiffusionReaction(s.laplacian, closure=js.without_flux(s))
+    given = dict(t1=0.1, fields=bowl.points[:, 0], problem=heat)
+    with pytest.raises(
+        ValueError, match=r"more\) lies on the border, but MeanCurv.* closed surfaces"
+    ):
+        js.evolve(js.MeanCurvatureFlow(), bowl, **given)
 
 
 def test_progress_bar(capfd):

@@ -104,6 +104,7 @@ def run(quick: bool, out: Path) -> list[Row]:
     more, one = made_one(spheres(n), spacing, 2 * spacing, (0.3, 0.4))
     for name, series in (("apart", apart), ("one", one)):
         depth = [np.abs(np.asarray(c.points)[:, 0]) for c in series.clouds]
-        path, view = out / f"e11_{name}.png", (0.6, -1.7, 0.7)
+        # From aside: in front of each other they would seem to have crossed.
+        path, view = out / f"e11_{name}.png", (0.0, -1.7, 0.3)
         js.plot_series(series.clouds, depth, times=series.ts, path=path, label="|x|", view=view)
     return rows + more

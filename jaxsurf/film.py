@@ -27,6 +27,11 @@ from jaxsurf.series import Frame, frames_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# So many pictures of a film say which colours it needs.
+_LOOKED_AT = 8
+# From here on, of 255, colours of a film are made white.
+_WHITE = 248
+
 
 def plot_series(
     clouds: PointCloud | Sequence[PointCloud],
@@ -140,13 +145,34 @@ def animate(
 def _writer(path: Path, fps: float):
     from matplotlib.animation import FFMpegWriter, PillowWriter
 
-    kinds: dict[str, Any] = {".gif": PillowWriter, ".mp4": FFMpegWriter}
+    class Gif(PillowWriter):
+        """All pictures in the same 256 colours: else each has its own, and the bar flickers."""
+
+        def finish(self):
+            pictures = vars(self)["_frames"]
+            pictures[:] = in_same_colors(pictures)
+            super().finish()
+
+    kinds: dict[str, Any] = {".gif": Gif, ".mp4": FFMpegWriter}
     if path.suffix.lower() not in kinds:
         raise ValueError(f"{path}: unknown suffix {path.suffix!r}; films are .gif or .mp4")
     kind = kinds[path.suffix.lower()]
     if not kind.isAvailable():
         raise ImportError(f"{path}: films of this kind need ffmpeg; .gif needs nothing more")
     return kind(fps=fps)
+
+
+def in_same_colors(pictures: list) -> list:
+    """Pictures of one size by Pillow, in a palette made from some of them, first and last."""
+    from PIL import Image
+
+    chosen = np.unique(np.linspace(0, len(pictures) - 1, _LOOKED_AT).round().astype(int))
+    some = np.concatenate([np.asarray(pictures[i].convert("RGB")) for i in chosen])
+    palette = Image.fromarray(some).quantize(256)
+    colors = np.asarray(palette.getpalette()).reshape(-1, 3)
+    colors[colors.min(axis=1) >= _WHITE] = 255  # else paper is grey
+    palette.putpalette(colors.ravel().tolist())
+    return [picture.convert("RGB").quantize(palette=palette) for picture in pictures]
 
 
 class Film(NamedTuple):

@@ -27,7 +27,7 @@ from .stencils.targets import Gradient
 
 
 def eliminate(
-    cloud: PointCloud,
+    cloud: PointCloud | Discretization,
     conditions: Condition | Sequence[Condition],
     *,
     neighbors: Neighbors | None = None,
@@ -42,8 +42,10 @@ def eliminate(
     other. Dirichlet conditions need no stencil, and hold on any set of points.
 
     Args:
-        cloud: n points with unit normals. Points under no condition are free; on the border of
-            the surface they have to be named by `free`, or solvers refuse the operator.
+        cloud: n points with unit normals, or a surface from `discretize`, which then has
+            neighbours and border: so also where points are traced, within `evolve`. Points under
+            no condition are free; on the border of the surface they have to be named by `free`,
+            or solvers refuse the operator.
         conditions: one or several; together they may name a point twice only if they agree.
         neighbors: lists for all n points, of which the free ones are used; if None, the
             nearest free points are searched for (host only).
@@ -78,6 +80,10 @@ def eliminate(
         >>> bool((closure(jnp.zeros(500)) == jnp.where(equator, 2.0, 0.0)).all())
         True
     """
+    if isinstance(cloud, Discretization):
+        neighbors = cloud.neighbors if neighbors is None else neighbors
+        border = cloud.border if border is None else border
+        cloud = cloud.cloud
     conditions, owner = checked_conditions(cloud, conditions)
     instance(method, AbstractMethod, "method", "as js.GFDM(degree=2)")
     check_parts(cloud, neighbors, border)

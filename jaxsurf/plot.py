@@ -98,7 +98,13 @@ def draw(ax, scene: Scene, values, colors: Colors | None, title: str | None) -> 
 
 def add_bar(figure, axes, colors: Colors, label: str | None) -> None:
     bar = figure.colorbar(
-        colors.mappable(), ax=axes, shrink=0.72, aspect=28, pad=0.02, extend=colors.extend
+        colors.mappable(),
+        ax=axes,
+        shrink=0.72,
+        aspect=28,
+        pad=0.02,
+        extend=colors.extend,
+        panchor=False,
     )
     bar.outline.set_visible(False)
     bar.ax.tick_params(length=2.5, labelsize="small")

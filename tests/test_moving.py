@@ -169,6 +169,28 @@ def test_waves_are_diluted_in_their_velocity():
     assert float(jnp.linalg.norm(end.fields[-1][0] - u) / jnp.linalg.norm(u)) < 2e-2
 
 
+def test_waves_on_a_border_that_moves_have_the_velocity_of_what_they_are_given_there():
+    """Values that ride on the rim of a bowl that grows change with its place, too."""
+    root, t = 6**0.5, 0.7
+    bowl = js.surface_of_revolution(
+        lambda s: (jnp.sin(s), -jnp.cos(s)), 200, interval=(0, np.pi / 2)
+    )
+    rim = np.flatnonzero(bowl.boundary)
+
+    def problem(surface):
+        x, y, _ = surface.cloud.points[rim].T
+        given = js.dirichlet(rim, lambda t: jnp.sin(root * t) * x * y)
+        return js.WaveEquation(surface.laplacian, closure=js.eliminate(surface, given))
+
+    moving = Moving.of(js.discretize(bowl, method=SURFACE.method), js.Motion(growing), problem)
+    product = bowl.points[:, 0] * bowl.points[:, 1]
+    sine, cosine = np.sin(root * t), np.cos(root * t)
+    exact = sine * product, (root * cosine + 2 * RATE * sine) * product
+    state = bowl.points, tuple(jnp.where(bowl.boundary, 7.0, u) for u in exact)
+    for found, wanted in zip(moving.fields(t, state, RATE), exact):
+        np.testing.assert_allclose(found, wanted, atol=1e-12)
+
+
 @pytest.mark.slow
 def test_derivatives_through_the_motion():
     """In rate, points and fields, against differences: all in one program."""
@@ -265,6 +287,45 @@ def test_heat_stays_within_borders_that_move_with_it():
     assert jnp.abs(phi - 1.5**-0.5).max() < 1e-2
     mass = run.history["mass"]
     assert abs(mass[1] / mass[0] - 1) < 1e-2
+
+
+def test_conditions_of_a_surface_also_where_it_is_traced():
+    """Its neighbours and border are taken, which nothing can search for there."""
+    bowl = js.surface_of_revolution(
+        lambda s: (jnp.sin(s), -jnp.cos(s)), 200, interval=(0, np.pi / 2)
+    )
+    rim, product = np.flatnonzero(bowl.boundary), bowl.points[:, 0] * bowl.points[:, 1]
+
+    def filled(scale):
+        moved = js.discretize(bowl, method=SURFACE.method).moved(scale * bowl.points)
+        # Nothing of x y leaves through the rim, where z = 0.
+        flux = js.robin(rim, a=1.0, b=1.0, value=product[rim])
+        return js.eliminate(moved, flux)(jnp.where(bowl.boundary, 0, product))
+
+    for scale in (1.0, 1.5):
+        found = jax.jit(filled)(scale)
+        np.testing.assert_allclose(found, filled(scale), atol=1e-9)
+        np.testing.assert_allclose(found, product, atol=5e-3)
+
+
+def test_a_flow_of_a_border_is_refused_for_what_it_is():
+    bowl = js.surface_of_revolution(
+        lambda s: (jnp.sin(s), -jnp.cos(s)), 200, interval=(0, np.pi / 2)
+    )
+    heat = lambda s: js.AdvectionDiffusionReaction(s.laplacian, closure=js.without_flux(s))
+    given = dict(t1=0.1, fields=bowl.points[:, 0], problem=heat)
+    with pytest.raises(
+        ValueError, match=r"more\) lies on the border, but MeanCurv.* closed surfaces"
+    ):
+        js.evolve(js.MeanCurvatureFlow(), bowl, **given)
+
+
+def test_progress_bar(capfd):
+    """In units of t, in few digits: 0.1 + 0.2 is 0.30000000000000004."""
+    drift = js.Motion(lambda t, surface, fields, args: 0 * surface.cloud.normals)
+    js.evolve(drift, js.circle(60), t1=0.1 + 0.2, saveat=[0.1], progress=True)
+    told = capfd.readouterr().err
+    assert "t = 0.3 of 0.3" in told and "0000" not in told
 
 
 def test_where_a_surface_has_no_areas_a_step_is_refused_not_an_error():

@@ -176,6 +176,25 @@ def test_a_film_has_a_picture_for_each_time(tmp_path):
     assert PIL.Image.open(path).n_frames == 2
 
 
+def test_films_stay_in_the_middle_and_in_their_colours(tmp_path):
+    """Of a narrow surface whose field uses ever more of the map: the bar is the same throughout."""
+    thin = lambda k: PointCloud(np.asarray(sphere(300).points) * [0.3, 0.3, k], sphere(300).normals)
+    clouds = [thin(k) for k in (0.4, 1.0)]
+    path = tmp_path / "film.gif"
+    animate(path, clouds, [0 * clouds[0].points[:, 2], clouds[1].points[:, 2]], dpi=60, pixels=80)
+    film, pictures = PIL.Image.open(path), []
+    for i in range(2):
+        film.seek(i)
+        pictures.append(np.asarray(film.convert("RGB"), int))
+    width = pictures[0].shape[1]
+    bar = [picture[:, int(0.83 * width) :] for picture in pictures]
+    assert np.abs(bar[0] - bar[1]).mean() < 0.2
+    for picture in pictures:
+        assert np.all(picture[0, 0] == 255)
+        shape = picture[:, : int(0.83 * width)].min(axis=2) < 250
+        assert abs(np.nonzero(shape)[1].mean() / width - 0.42) < 0.05
+
+
 def test_bad_input():
     cloud = sphere(100)
     with pytest.raises(ValueError, match=r"field has shape \(99,\), expected \(100,\)"):

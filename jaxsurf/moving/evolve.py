@@ -142,9 +142,10 @@ def evolve(
         t1, t0: end and start.
         fields: on the cloud, `(n, *c)`, or several as a tuple; none by default.
         problem: makes the problem of the fields from the surface, say
-            `lambda surface: js.AdvectionDiffusionReaction(surface.laplacian)`. What it conserves is
-            diluted as the surface grows; of a `WaveEquation` that is $\partial_t u$. If None,
-            fields go with the points unchanged.
+            `lambda surface: js.AdvectionDiffusionReaction(surface.laplacian)`; and the conditions
+            at its border, by `eliminate(surface, ...)` or `without_flux(surface)`. What it
+            conserves is diluted as the surface grows; of a `WaveEquation` that is
+            $\partial_t u$. If None, fields go with the points unchanged.
         method: of the operators; `GFDM(degree=4)` if None, or that of a surface given.
         saveat: times to save; t1 is always saved.
         solver, dt0, rtol, atol: as for `integrate`; the solver that suits motion and problem if
@@ -175,7 +176,8 @@ def evolve(
     Raises:
         TypeError: arguments of other kinds.
         ValueError: wrong shapes; times that are not in order; on concrete arrays a surface that
-            folds (named by index, see `Discretization.code`), a fit that turns a normal over.
+            folds (named by index, see `Discretization.code`), a fit that turns a normal over; a
+            border, by a motion that holds derivatives of positions.
             Differentiated or compiled, an error of the run time.
         IntegrationError: the end was not reached, see `integrate`. (A checkpoint is refused as
             there: damaged, or of another run.)
@@ -200,6 +202,8 @@ def evolve(
     fields = jax.tree.map(field, fields)
     _check_types(fields, surface.cloud.points)
     concrete = is_concrete(surface, fields, args, t0, t1, motion)
+    if motion.derivatives and concrete:
+        _check_closed(motion, surface)
     looked: dict[str, Any] = {"adapt": adapt, "contact": contact, "checkpoint": checkpoint}
     if not concrete:
         _refuse_looks(looked)
@@ -244,6 +248,17 @@ def _refuse_looks(looked: dict[str, Any]) -> None:
     for name, value in looked.items():
         if value is not None:
             raise ValueError(f"{name} needs concrete arrays: it is the host that looks at them")
+
+
+def _check_closed(motion: AbstractMotion, surface: Discretization) -> None:
+    """Refuse flows of a border, of which nothing says how it moves."""
+    if surface.border is not None:
+        text = (
+            f"point {{i}}{{more}} lies on the border, but {motion!r} is of closed surfaces only: "
+        )
+        marked = np.zeros(surface.n, bool)
+        marked[np.asarray(surface.border.points)] = True
+        raise_at(marked, text + "conditions of a problem hold for its fields, not for positions")
 
 
 def _check_problem(made: AbstractEvolution, fields, n: int) -> None:
@@ -320,7 +335,8 @@ def _kept(moving: Moving, state, t, times, options) -> Evolution:
         # Whatever is looked at of it, fields alone or points.
         kept = functools.partial(refuse, bad=jnp.any(code > 0), message=text)
         state = jax.tree.map(kept, state)
-        rows.append((moving.surface_at(parted(state)[0]), moving.fields(target, state)))
+        fields = moving.fields(target, state, options["args"])
+        rows.append((moving.surface_at(parted(state)[0]), fields))
     return Evolution(jnp.stack([jnp.asarray(s) for s in times]), rows, {})
 
 

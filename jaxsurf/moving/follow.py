@@ -41,6 +41,7 @@ _ROOM = 2.0
 # Sheets that approach are looked at before a step has taken them nearer by this share of the
 # distance at which they touch.
 _PAST = 0.05
+_BAR = "t = {n:.4g} of {total:.4g} |{bar}| {percentage:3.0f}% [{elapsed}<{remaining}]"
 # Of the way that is left; a surface that cannot be followed this far is an error.
 _LEAST = 1e-6
 # Looks at points are due early by this share of the time between them: round-off makes none.
@@ -108,7 +109,7 @@ def followed(
         run.change(run.moving.surface)
         now = now._replace(place=run.place, changes=run.changes)
     saved = list(now.saved)
-    with tqdm(total=float(times[-1] - start), disable=not progress, unit="t") as bar:
+    with tqdm(total=float(times[-1] - start), disable=not progress, bar_format=_BAR) as bar:
         run.tell = lambda t: bar.update(float(t - start) - bar.n)
         for part in range(int(now.part), len(ends)):
             t, end = ends[part - 1] if part else start, ends[part]
@@ -208,7 +209,7 @@ class _Run:
         surface = self.moving.surface_at(self.state[0])
         # What was wrong with it would have been an error.
         surface = eqx.tree_at(lambda s: s.found, surface, None, is_leaf=lambda x: x is None)
-        fields = self.moving.fields(self.t, self.state)
+        fields = self.moving.fields(self.t, self.state, self.options["args"])
         return _Place(surface, joined(self.state[0], fields))
 
     def count(self, steps: int, refused: int, renewals: int) -> None:

@@ -19,6 +19,7 @@ from ..motion import carried, moved_cloud
 from ..normals import refit_normals
 from ..stencils.stencil import Stencil
 from ..time.explicit import RKC2
+from ..time.higher import WaveEquation
 from ..time.implicit import IMEX
 from ..time.problem import AbstractEvolution
 from .contact import Faced
@@ -101,15 +102,8 @@ class Moving(AbstractEvolution):
         points, fields = parted(u)
         surface = self.surface_at(points)
         problem = None if self.on is None else self.on(surface)
-        fields = fields if problem is None else problem.closed(t, fields)
-        # A step that is tried may take the surface to where it has none: it is refused, and a
-        # shorter one is tried.
-        with marking():
-            velocity = self.motion.velocity(t, surface, fields, args)
-        name = f"velocity of {type(self.motion).__name__}"
-        velocity = as_float(velocity, name, points.shape).astype(points.dtype)
-        if self.faced is not None:
-            velocity = self.faced.kept_apart(points, surface.cloud.normals, velocity)
+        fields = self._filled(t, surface, fields, args, problem)
+        velocity = self._velocity(t, surface, fields, args)
         changes = [jax.tree.map(jnp.zeros_like, fields)]
         if problem is not None:
             dilution = problem.dilution(fields, surface.divergence(velocity))
@@ -138,12 +132,45 @@ class Moving(AbstractEvolution):
         return jax.tree.map(jnp.subtract, self.rate(t, u, args), self.linear(t, u))
 
     def closed(self, t, u):
-        return joined(u[0], self.fields(t, u))
-
-    def fields(self, t, u: PyTree[Array]) -> PyTree[Array]:
-        """With their bound values filled in."""
         points, fields = parted(u)
-        return fields if self.on is None else self.on(self.surface_at(points)).closed(t, fields)
+        at_rest = fields if self.on is None else self.on(self.surface_at(points)).closed(t, fields)
+        return joined(points, at_rest)
+
+    def fields(self, t, u: PyTree[Array], args) -> PyTree[Array]:
+        """With their bound values filled in, and rates of those at the speed of the surface."""
+        points, fields = parted(u)
+        surface = self.surface_at(points)
+        problem = None if self.on is None else self.on(surface)
+        return self._filled(t, surface, fields, args, problem)
+
+    def _velocity(self, t, surface: Discretization, fields, args) -> Float[Array, "n d"]:
+        points = surface.cloud.points
+        # A step that is tried may take the surface to where it has none: it is refused, and a
+        # shorter one is tried.
+        with marking():
+            velocity = self.motion.velocity(t, surface, fields, args)
+        name = f"velocity of {type(self.motion).__name__}"
+        velocity = as_float(velocity, name, points.shape).astype(points.dtype)
+        if self.faced is None:
+            return velocity
+        return self.faced.kept_apart(points, surface.cloud.normals, velocity)
+
+    def _filled(self, t, surface: Discretization, fields, args, problem) -> PyTree[Array]:
+        """Bound entries as conditions say; those of a wave's velocity along the paths of points.
+
+        A condition on a border that moves changes with its place: that is part of the velocity.
+        """
+        if problem is None:
+            return fields
+        fields = problem.closed(t, fields)
+        if not isinstance(problem, WaveEquation) or problem.closure is None or self.on is None:
+            return fields
+        value, rate = fields
+        points, on = surface.cloud.points, self.on
+        filled = lambda t, x, value: on(self.surface_at(x)).closed(t, (value, rate))[0]
+        now = (jnp.asarray(t, points.dtype), points, value)
+        speeds = (jnp.ones_like(now[0]), self._velocity(t, surface, fields, args), rate)
+        return jax.jvp(filled, now, speeds)
 
 
 def fitted_normals(surface: Discretization, points: Array, normals: Array) -> Array:

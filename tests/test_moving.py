@@ -1,5 +1,7 @@
 r"""Surfaces that move, and equations on them, against exact solutions."""
 
+import warnings
+
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
@@ -318,6 +320,17 @@ def test_a_flow_of_a_border_is_refused_for_what_it_is():
         ValueError, match=r"more\) lies on the border, but MeanCurv.* closed surfaces"
     ):
         js.evolve(js.MeanCurvatureFlow(), bowl, **given)
+
+
+def test_operators_of_another_surface_do_not_pass_in_silence():
+    """A Laplacian made before is that of the surface at t0, whatever becomes of it."""
+    stays = lambda _: js.AdvectionDiffusionReaction(SURFACE.laplacian)
+    with pytest.warns(UserWarning, match="not made from the surface") as told:
+        grown(t1=0.1, problem=stays)
+    assert {str(one.message)[:20] for one in told} == {"an operator of the p"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        grown(t1=0.1)
 
 
 def test_progress_bar(capfd):

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PyTree
 from ..arguments import as_float, switched_off
 from ..cloud import PointCloud
 from ..discretization import Discretization
-from ..failures import marking
+from ..failures import is_concrete, marking, warn
 from ..functions import numbers_as_arrays
 from ..motion import carried, moved_cloud
 from ..normals import refit_normals
@@ -102,6 +102,7 @@ class Moving(AbstractEvolution):
         points, fields = parted(u)
         surface = self.surface_at(points)
         problem = None if self.on is None else self.on(surface)
+        _check_made_here(problem, points)
         fields = self._filled(t, surface, fields, args, problem)
         velocity = self._velocity(t, surface, fields, args)
         changes = [jax.tree.map(jnp.zeros_like, fields)]
@@ -171,6 +172,18 @@ class Moving(AbstractEvolution):
         now = (jnp.asarray(t, points.dtype), points, value)
         speeds = (jnp.ones_like(now[0]), self._velocity(t, surface, fields, args), rate)
         return jax.jvp(filled, now, speeds)
+
+
+def _check_made_here(problem: AbstractEvolution | None, points: Array) -> None:
+    """Say so where operators are known before the surface is, as those of another are."""
+    if problem is None or is_concrete(points):
+        return
+    arrays = [jax.tree.leaves(eqx.filter(each, eqx.is_array)) for each in problem.operators]
+    if any(held and is_concrete(held) for held in arrays):
+        warn(
+            "an operator of the problem is not made from the surface that it is given, but stays "
+            "that of another: lambda surface: js.AdvectionDiffusionReaction(surface.laplacian), say"
+        )
 
 
 def fitted_normals(surface: Discretization, points: Array, normals: Array) -> Array:

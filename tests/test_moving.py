@@ -40,17 +40,18 @@ def exact(eigenvalue, t=1.0, rate=RATE):
 
 
 @pytest.mark.slow
-def test_solvers_keep_their_order_though_the_geometry_moves():
+@pytest.mark.parametrize("order, slope, largest", [(1, 0.9, 0.3), (3, 2.7, 1e-3)])
+def test_solvers_keep_their_order_though_the_geometry_moves(order, slope, largest):
     """Steps halved; the eigenvalue is that of the stencils, so that only time is judged."""
     eigenvalue = float(jnp.vdot(X * Y, SURFACE.laplacian(X * Y)) / jnp.vdot(X * Y, X * Y))
     errors = []
     for steps in (16, 32):
-        end = grown(solver=js.IMEX(order=3), dt0=1 / steps)
+        end = grown(solver=js.IMEX(order=order), dt0=1 / steps)
         factor = float(jnp.vdot(X * Y, end.fields[-1]) / jnp.vdot(X * Y, X * Y))
         errors.append(abs(factor / exact(eigenvalue) - 1))
         radius = jnp.linalg.norm(end.clouds[-1].points, axis=1)
         assert float(jnp.abs(radius - 1.5).max()) < 1e-10
-    assert np.log2(errors[0] / errors[1]) > 2.7 and errors[1] < 1e-3
+    assert np.log2(errors[0] / errors[1]) > slope and errors[1] < largest, errors
 
 
 @pytest.mark.slow

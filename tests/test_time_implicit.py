@@ -20,6 +20,7 @@ ANGLES, LAPLACIAN, _ = ring(24)
 N, X, Z = len(ANGLES), jnp.cos(ANGLES), jnp.sin(ANGLES)
 SLOW = float(-2 * (1 - jnp.cos(ANGLES[1])) / ANGLES[1] ** 2)  # of cos and sin
 SOLVERS = [
+    js.IMEX(order=1),
     js.IMEX(order=2),
     js.IMEX(order=3),
     js.IMEX(order=4),
@@ -50,9 +51,9 @@ def test_tableaus_satisfy_the_order_conditions(order, tableau):
     implicit = tableau.implicit + np.diag(tableau.diagonal)
     explicit = tableau.explicit
     assert np.ptp(tableau.diagonal[1:]) == 0
-    b, c = tableau.weights, tableau.nodes
-    matrices = [implicit] if order in _SDIRK and tableau is _SDIRK[order] else [implicit, explicit]
-    for A in matrices:
+    c, parts = tableau.nodes, [*zip((explicit, implicit), tableau.weights, strict=True)]
+    whole = order in _SDIRK and tableau is _SDIRK[order]
+    for A, b in parts[1:] if whole else parts:
         np.testing.assert_allclose(A.sum(axis=1), c, atol=1e-12)
         for condition, value in trees(order):
             assert condition(b, c, A) == pytest.approx(value, abs=1e-12)
@@ -91,11 +92,11 @@ def manufactured_mild(t, u, args):
 
 
 @pytest.mark.parametrize("kind", [js.IMEX, js.SDIRK])
-@pytest.mark.parametrize("order", [2, 3, 4])
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
 def test_order_of_steps_that_are_not_stiff(kind, order):
     """Linear systems solved well, no mode faster than the steps."""
-    if kind is js.SDIRK and order == 2:
-        pytest.skip("there is none of order 2")
+    if kind is js.SDIRK and order < 3:
+        pytest.skip(f"there is none of order {order}")
     one = js.AdvectionDiffusionReaction(MILD, reaction=manufactured_mild)
     solver = kind(order=order, tolerance=1e-10)
     errors = []
@@ -105,14 +106,14 @@ def test_order_of_steps_that_are_not_stiff(kind, order):
     for steps in counts:
         u = js.integrate(one, mild(0.0), t1=1.0, solver=solver, dt0=1 / steps).ys[-1]
         errors.append(float(jnp.abs(u - mild(1.0)).max()))
-    assert errors[-1] < (1e-5 if early else {2: 1e-5, 3: 1e-6, 4: 1e-8}[order])
+    assert errors[-1] < (1e-5 if early else {1: 1e-2, 2: 1e-5, 3: 1e-6, 4: 1e-8}[order])
     slope = np.log(errors[0] / errors[1]) / np.log(counts[1] / counts[0])
-    assert slope > {2: 1.8, 3: 2.7, 4: 3.6}[order]
+    assert slope > {1: 0.9, 2: 1.8, 3: 2.7, 4: 3.6}[order]
 
 
 # Least slopes with stiff modes, each more than a method of one order less can have. The stages of
 # SDIRK are of order 2: with modes faster than the steps its order is between 3 and its own.
-STIFF = {"IMEX2": 1.9, "IMEX3": 2.9, "IMEX4": 3.9, "SDIRK3": 2.7, "SDIRK4": 3.4}
+STIFF = {"IMEX1": 0.9, "IMEX2": 1.9, "IMEX3": 2.9, "IMEX4": 3.9, "SDIRK3": 2.7, "SDIRK4": 3.4}
 
 
 @pytest.mark.parametrize("solver", SOLVERS, ids=NAMES)
@@ -122,7 +123,7 @@ def test_order(solver, exact):
     for steps in (10, 20):
         u = js.integrate(problem(), u0, t1=0.5, args=1.0, solver=solver, dt0=0.5 / steps).ys[-1]
         errors.append(float(jnp.linalg.norm(u - expected) / jnp.linalg.norm(expected)))
-    largest = {2: 2e-3, 3: 5e-4, 4: 1e-4}[solver.scheme]
+    largest = {1: 5e-2, 2: 2e-3, 3: 5e-4, 4: 1e-4}[solver.scheme]
     assert errors[-1] < largest
     slope = np.log2(errors[0] / errors[1])
     assert slope > STIFF[f"{type(solver).__name__}{solver.scheme}"], slope

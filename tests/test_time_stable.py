@@ -149,8 +149,13 @@ def quick_decay(surface):
 
 @pytest.mark.parametrize(
     "solver, problem, step",
-    [(js.IMEX(), quick_decay, 0.02), (js.IMEX(order=2), spun, 0.05), (js.RKC2(), spun, 0.05)],
-    ids=["IMEX, reaction", "IMEX, advection", "RKC2, advection"],
+    [
+        (js.IMEX(), quick_decay, 0.02),
+        (js.IMEX(order=1), quick_decay, 0.02),
+        (js.IMEX(order=2), spun, 0.05),
+        (js.RKC2(), spun, 0.05),
+    ],
+    ids=["IMEX, reaction", "IMEX1, reaction", "IMEX, advection", "RKC2, advection"],
 )
 def test_on_surfaces_that_move(solver, problem, step):
     """Fields came back with values of 1e109, 1e122 and 1e91."""

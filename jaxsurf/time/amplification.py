@@ -150,10 +150,9 @@ def amplification_of(solver: dfx.AbstractSolver) -> AbstractAmplification | None
     if isinstance(solver, IMEX):
         known = solver.tableau
         lower = lambda m: _rows([row[:i] for i, row in enumerate(m) if i])
-        weights = _numbers(known.weights)
         return Additive(
             lower(known.explicit), lower(known.implicit), _numbers(known.diagonal[1:]),
-            (weights, weights),
+            _rows(known.weights),
         )  # fmt: skip
     if isinstance(solver, dfx.Euler):
         return Tableau((), (1.0,))

@@ -1,8 +1,7 @@
 r"""A surface that moves: what a move and a step take in units of a build, memory of a gradient.
 
-The steps are the paper's on the expanding sphere (E13, `e14_steps.first_order`): points by Euler's
-move, operators built there, an implicit step of the field, 0.4 h² long for smoothing lengths h. At
-a fixed length the systems would become stiffer with n, and Jacobi's preconditioner no longer do.
+The steps are the paper's on the expanding sphere (E13 and E14, `e14_steps.first_order`): points by
+Euler's move, operators built there, an implicit step of the field.
 """
 
 from __future__ import annotations
@@ -21,12 +20,8 @@ from ..expanding import GROWTH, SIZES, decayed, heat, product
 from ..report import relative_l2
 from .timing import first_and_median, peak_gib
 
-_STEPS = 20
-
-
-def _length(n: int) -> float:
-    """Of a step: the paper's 1e-3 at its h = 0.05, where 1,000 of them lead to t = 1."""
-    return 1e-3 * SIZES[0.05] / n
+# Of the paper: 1,000 to t = 1.
+_STEPS, _DT = 20, 1e-3
 
 
 def plan(quick: bool) -> list[tuple[str, list]]:
@@ -104,10 +99,10 @@ def step(n: int) -> dict:
     x, u, search = surface.cloud.points, product(surface.cloud.points), surface.search()
     gradient, normals = surface.gradient, surface.cloud.normals
     spacing = jnp.full(n, np.sqrt(4 * np.pi / n))
-    adapt, dt = js.Adaptation(float(spacing[0])), _length(n)
+    adapt = js.Adaptation(float(spacing[0]))
 
     def solved(weights, u):
-        implicit = 1 - dt * surface.laplacian.of_weights(weights)
+        implicit = 1 - _DT * surface.laplacian.of_weights(weights)
         return js.solve(implicit, u, preconditioner=js.jacobi(implicit), mean_zero=False).value
 
     parts = {
@@ -122,7 +117,7 @@ def step(n: int) -> dict:
     found = {}
     for name, part in parts.items():
         found[name] = first_and_median(lambda part=part: part(1.01 * x), 5)[1]
-    whole = lambda: e14_steps.first_order(surface, _STEPS, _STEPS * dt)
+    whole = lambda: e14_steps.first_order(surface, _STEPS, _STEPS * _DT)
     found["step"] = first_and_median(whole, 3)[1] / _STEPS
     return found | {f"{name} / build": s / found["build"] for name, s in found.items()}
 

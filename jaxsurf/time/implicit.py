@@ -150,7 +150,7 @@ class IMEX(_Implicit):
     Accuracy: of that order in the step where no mode is faster than the steps: more than 0.9,
     1.8, 2.7 and 3.6 (`tests/test_time_implicit.py::test_order_of_steps_that_are_not_stiff`). In
     float32 values are within 1e-3 and derivatives within 1e-2 at the default tolerances
-    (`tests/test_time_pde.py`), of order 1 at steps as short as that takes.
+    (`tests/test_time_pde.py`, of orders 2 to 4).
     Differentiable: forward and reverse, by the implicit function theorem; nothing of size n × n
     is ever made.
     Raises:

@@ -25,15 +25,13 @@ from .failures import (
 )
 from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .indices import mask as checked_mask
+from .machine import TRIED, block
 from .neighbors import Neighbors, Rows, find_neighbors, nearest_of, switched_on
 from .stencils.gathers import take
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood, weights_by
 from .stencils.stencil import Stencil
 from .stencils.targets import Laplacian
 from .stencils.usual import USUAL
-
-# Stencils that are tried at a time: few shapes are ever compiled.
-_CHUNK = 256
 
 
 def choose_neighbors(
@@ -133,7 +131,7 @@ def stencil_weights(
     """
     rows = np.arange(cloud.n, dtype=np.int32) if rows is None else rows
     size = whole(method.batch_size, f"batch_size of {method}", least=1)
-    blocks = blocks_of(cloud, neighbors, rows, size)
+    blocks = blocks_of(cloud, neighbors, rows, block(size))
     return rows_of(*_weights_of_blocks(blocks, method, target), len(rows))
 
 
@@ -204,7 +202,7 @@ def _chosen(cloud, method, throw, needed, fewest):
         return neighbors, found
 
     # Filled up with copies, so that few shapes are ever compiled.
-    rows = np.resize(poor, -(-poor.size // _CHUNK) * _CHUNK)
+    rows = np.resize(poor, -(-poor.size // TRIED) * TRIED)
     wide = nearest_of(cloud, rows, max(sizes))
     points, chosen, best = np.asarray(cloud.points), np.full(rows.size, k), share[rows]
     lists = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
@@ -238,8 +236,8 @@ def _chosen(cloud, method, throw, needed, fewest):
 def _in_chunks(cloud, indices, mask, method, rows):
     """Weights and diagnostics of the Laplacian of some rows, on the host."""
     parts = []
-    for start in range(0, len(rows), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for start in range(0, len(rows), TRIED):
+        part = slice(start, start + TRIED)
         some = Rows(indices[part], mask[part])
         parts.append(stencil_weights(cloud, some, method, Laplacian(), rows[part]))
     return jax.tree.map(lambda *a: np.concatenate([np.asarray(b) for b in a], axis=-1), *parts)

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from .arguments import as_float, finite, instance, real, whole
 from .failures import is_concrete, refuse, unchecked
 from .indices import mask
+from .machine import COUNTED, block
 from .neighbors import Neighbors
 from .sheets import cosine_slack
 
@@ -140,7 +141,7 @@ def search_neighbors(
     active: Bool[Array, " n"] | None = None,
     min_cosine: float = 0.0,
     throw: bool = True,
-    batch_size: int = 1024,
+    batch_size: int = COUNTED,
 ) -> tuple[Neighbors, SearchReport]:
     r"""Neighbours within a radius, found on the device, under jit, for points that move.
 
@@ -159,7 +160,7 @@ def search_neighbors(
         active: False for rows that are switched off, `(n,)`.
         min_cosine: least cosine between the normals of neighbours.
         throw: raise when the capacity is exceeded, also from within jit.
-        batch_size: points treated at a time; bounds the memory.
+        batch_size: points treated at a time on a CPU, elsewhere in proportion; bounds the memory.
 
     Returns:
         Neighbour lists with `capacity.k` slots (or k), and what was needed and available. If
@@ -196,7 +197,7 @@ def search_neighbors(
     real(min_cosine, "min_cosine", least=-1, most=1)
     # Numbers go in as arrays: another value compiles nothing.
     bounds = tuple(jnp.asarray(value, points.dtype) for value in (radius, min_cosine))
-    batch_size = min(whole(batch_size, "batch_size", least=1), len(points))
+    batch_size = min(block(whole(batch_size, "batch_size", least=1)), len(points))
     return _search((points, normals), active, bounds, capacity, k, throw, batch_size)
 
 

@@ -13,18 +13,13 @@ import numpy as np
 
 from .arguments import is_array
 from .failures import is_concrete
+from .machine import PIECE, QUICK, machine
 
 if TYPE_CHECKING:
     AnyArray = Any  # the kind that goes in comes out
 else:
     AnyArray = jax.Array | np.ndarray
 
-# Quicker to compile, slower to run; `is_quick` asks for simpler forms beside.
-_QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
-# Blocks that are treated by one call where arrays are small.
-_PIECE = 8
-# Numbers given to a program, in all its arrays, below which it is small.
-_SMALL = 1_750_000
 # What is computed within is computed at once, also while something else is traced. (JAX's
 # `ensure_compile_time_eval` would take apart the programs called in it as well, and compile what
 # depends on constants alone operation by operation.)
@@ -82,7 +77,7 @@ def _programs(f: Callable) -> tuple[Callable, Callable]:
         return call
 
     program.__name__ = quick_program.__name__ = f.__name__
-    quick = jax.jit(quick_program, static_argnums=(1, 2), compiler_options=_QUICK)
+    quick = jax.jit(quick_program, static_argnums=(1, 2), compiler_options=QUICK)
     return called(jax.jit(program, static_argnums=(1, 2))), called(quick)
 
 
@@ -110,8 +105,8 @@ def pieces_jit(f: Callable) -> Callable:
 def _by_pieces(program: Callable, blocks, args: tuple):
     leaves, structure = jax.tree.flatten(blocks)
     parts = []
-    for first in range(0, len(leaves[0]), _PIECE):
-        rows = [a[first : first + _PIECE] for a in leaves]
+    for first in range(0, len(leaves[0]), PIECE):
+        rows = [a[first : first + PIECE] for a in leaves]
         piece, count = jax.tree.unflatten(structure, map(_filled_up, rows)), len(rows[0])
         found, shape = jax.tree.flatten(program(piece, np.array(count, np.int32), *args))
         parts.append([np.asarray(a)[:count] for a in found])
@@ -119,9 +114,9 @@ def _by_pieces(program: Callable, blocks, args: tuple):
 
 
 def _filled_up(blocks: np.ndarray) -> np.ndarray:
-    if len(blocks) == _PIECE:
+    if len(blocks) == PIECE:
         return blocks
-    room = np.zeros((_PIECE, *blocks.shape[1:]), blocks.dtype)
+    room = np.zeros((PIECE, *blocks.shape[1:]), blocks.dtype)
     room[: len(blocks)] = blocks
     return room
 
@@ -187,7 +182,7 @@ def namespace(a):
 
 def _takes_longer_to_compile(leaves: list) -> bool:
     """Whether a program of these arguments is taken to be compiled for longer than it runs."""
-    small = sum(a.size for a in leaves if is_array(a)) < _SMALL
+    small = sum(a.size for a in leaves if is_array(a)) < machine().quick
     return small and is_concrete(*leaves) and _is_known()
 
 
@@ -197,7 +192,7 @@ def _is_known() -> bool:
         return False
     try:
         with at_once():
-            jax.jit(lambda: 0, compiler_options=_QUICK)()
+            jax.jit(lambda: 0, compiler_options=QUICK)()
     except (ValueError, RuntimeError):
         return False
     return True

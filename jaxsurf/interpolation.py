@@ -16,10 +16,9 @@ from .fits.moments import blockwise, in_blocks, moment_solve
 from .fits.monomials import monomials
 from .fits.plane import TangentPlane
 from .functions import constant
+from .machine import PAIRS, READ, block, block_of_pairs
 from .neighbors import Neighbors, Rows
 from .stencils.method import with_center
-
-_BATCH = 128
 
 
 def interpolated(
@@ -77,7 +76,9 @@ def _nearest(points, active, wanted):
         squared = jnp.sum((points - x) ** 2, axis=1)
         return jnp.argmin(squared if active is None else jnp.where(active, squared, jnp.inf))
 
-    return jax.lax.map(nearest, jax.lax.stop_gradient(wanted), batch_size=64).astype(jnp.int32)
+    return jax.lax.map(
+        nearest, jax.lax.stop_gradient(wanted), batch_size=block_of_pairs(PAIRS)
+    ).astype(jnp.int32)
 
 
 def _interpolation_weights(
@@ -93,7 +94,7 @@ def _interpolation_weights(
     passes through the centre; it is read off where the point stands above that plane.
     """
     slots, lists, at = _seen_from(cloud, neighbors, points, centers)
-    blocks = blocks_of(cloud, lists, centers, _BATCH)
+    blocks = blocks_of(cloud, lists, centers, block(READ))
     return slots, *rows_of(*_of_blocks((blocks, at), degree), len(points))
 
 
@@ -101,7 +102,7 @@ def _interpolation_weights(
 def _seen_from(cloud, neighbors, points, centers):
     """Neighbours of the centres, slots first; their lists; ways to the points, in blocks."""
     lists = Rows(neighbors.indices[centers], neighbors.mask[centers], neighbors.radius)
-    return lists.indices.T, lists, in_blocks((points - cloud.points[centers]).T, _BATCH)
+    return lists.indices.T, lists, in_blocks((points - cloud.points[centers]).T, block(READ))
 
 
 @pieces_jit

@@ -20,14 +20,13 @@ from jaxtyping import Array, Bool, Float, Int
 from .cells import distance_key
 from .checks import stands_above
 from .compiling import power_of_two
+from .machine import SEARCHED, block, machine
 from .sheets import cosine_slack
 
 # Cells are a little wider than the reach, so that rounding puts no neighbour beyond them.
 _MARGIN = 1.01
 # How many cells a width is cut into along the axis of the runs.
 _FINE = 4
-# Rows that are searched at a time: their candidates fit into the cache.
-_BLOCK = 512
 # Room beside the key of a distance for a number and a bit, in 64 bits.
 _LOW = 22
 
@@ -137,14 +136,15 @@ def nearest_in(
     Args:
         count: candidates that there is room for; where more are needed, the row is of no use.
         few: sort by the compiler's own sorting, which is sooner compiled; else by a network,
-            which is two to seven times as fast.
+            which on a CPU is two to seven times as fast.
     """
     find = lambda rows: _nearest(grid, rows, k, reach, count, min_cosine, few)
-    if len(rows) <= _BLOCK:
+    size = block(SEARCHED)
+    if len(rows) <= size:
         return find(rows)
-    n, blocks = len(rows), -(-len(rows) // _BLOCK)
-    rows = jnp.pad(rows, (0, blocks * _BLOCK - n), mode="edge")
-    found = jax.lax.map(find, rows.reshape(blocks, _BLOCK))
+    n, blocks = len(rows), -(-len(rows) // size)
+    rows = jnp.pad(rows, (0, blocks * size - n), mode="edge")
+    found = jax.lax.map(find, rows.reshape(blocks, size))
     # Blocks side by side.
     return jax.tree.map(
         lambda a: jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1)[..., :n], found
@@ -176,7 +176,7 @@ def _nearest(grid, rows, k, reach, count, min_cosine, few) -> Nearest:
     above = stands_above(squared, cosine, jnp.minimum(*rise))
     key = jnp.where(good, jnp.where(j == rows, -1, key), _last(key.dtype))
     keys = _packed(key, 2 * j + above, len(grid.order))
-    keys = _sorted_few(keys, k) if few else _smallest(keys, width, k)
+    keys = _sorted_few(keys, k) if few or machine().sorts else _smallest(keys, width, k)
     key, low = _unpacked(keys)
     mask = key < _last(key.dtype)
     above = mask & (low & 1 > 0)

@@ -17,6 +17,7 @@ from .fits.kernels import bell, enclosing
 from .fits.monomials import polynomial_count
 from .fits.plane import TangentPlane, dot
 from .indices import mask
+from .machine import FITTED, MOVING, block
 from .neighbors import Neighbors
 from .orient import check_one_sided, orient_normals, plane_normals
 from .sheets import nearest
@@ -26,7 +27,6 @@ _PIVOT = 100
 # A normal that still turns by more than this, in radians, has no fit to settle on.
 _LOOSE = 0.01
 # Points fitted per call while normals settle.
-_CHUNK = 4096
 
 
 def from_points(
@@ -158,7 +158,7 @@ def refit_normals(
     *,
     degree: int,
     iterations: int = 3,
-    batch_size: int = 256,
+    batch_size: int = FITTED,
 ) -> Float[Array, "n d"]:
     r"""Normals of local polynomials fitted over the tangent planes of the given normals.
 
@@ -173,7 +173,7 @@ def refit_normals(
         degree: polynomial degree p.
         iterations: times to repeat the fit over the new planes. Each brings the result, and
             its derivative, closer to those of the normals that no longer change.
-        batch_size: points treated at a time; bounds the memory.
+        batch_size: points treated at a time on a CPU, elsewhere in proportion; bounds the memory.
 
     Returns:
         Unit normals, `(n, d)`. Switched-off rows keep theirs. Under `jit`, `vmap` and `grad`
@@ -256,14 +256,14 @@ def _settle(points, guess, slots, mask, degree: int, iterations: int):
     slots = slots.astype(np.int32)
     pivot, turn, damping = np.ones(n, dtype), np.full(n, np.inf, dtype), np.ones(n, dtype)
     todo = np.arange(n, dtype=np.int32)
-    chunk = min(n, _CHUNK)
+    chunk = min(n, block(MOVING))
     for _ in range(iterations):
         for start in range(0, len(todo), chunk):
             part = todo[start : start + chunk]
             i = np.resize(part, chunk)
             new, low = (
                 np.asarray(a)[: len(part)]
-                for a in _refit(points, normals[i], slots[i], mask[i], None, degree, 1, 256)
+                for a in _refit(points, normals[i], slots[i], mask[i], None, degree, 1, FITTED)
             )
             step = new - normals[part]
             size = np.linalg.norm(step, axis=1)
@@ -302,7 +302,7 @@ def _refit(points, normals, slots, mask, radius, degree: int, iterations: int, b
 
     # Whole blocks only: an incomplete one would be compiled a second time.
     n = len(normals)
-    batch = min(batch_size, n)
+    batch = min(block(batch_size), n)
     which = jnp.arange(-(-n // batch) * batch) % n
     results = jax.lax.map(
         lambda r: row(*jax.tree.map(lambda a: a[r], (normals, slots, mask, radius))),

@@ -26,11 +26,10 @@ from .fits.moments import blockwise, in_blocks, moment_solve
 from .fits.monomials import polynomial_count
 from .fits.plane import TangentPlane
 from .fits.polygon import Sides, moments_over, ways_of
+from .machine import CELLS, block
 from .neighbors import Neighbors
 from .stencils.method import AbstractMethod, with_center
 
-# No power of two, see `GFDM.batch_size`.
-_BATCH = 100
 # So many neighbours may bound a cell; where points are very uneven, all are tried.
 _CELLS = 24
 
@@ -180,8 +179,8 @@ def _where_on(mask, closed, values):
 
 def _cells(cloud, neighbors, degree, cells, outward):
     """Planes, masks and moments of all cells in blocks, and whether they are closed."""
-    blocks = blocks_of(cloud, neighbors, np.arange(cloud.n, dtype=np.int32), _BATCH)
-    lines = None if outward is None else in_blocks(outward.T, _BATCH)
+    blocks = blocks_of(cloud, neighbors, np.arange(cloud.n, dtype=np.int32), block(CELLS))
+    lines = None if outward is None else in_blocks(outward.T, block(CELLS))
     mask, cells = blocks[2], min(cells, neighbors.k)
     # Programs of their own: in one, the compiler finds much again for every use of it, and a
     # derivative took fifteen times as long as the value.

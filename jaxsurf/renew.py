@@ -25,6 +25,7 @@ from .checks import DETOUR, LINK, RINGS, ring_size
 from .cloud import PointCloud
 from .compiling import sized_jit
 from .failures import unchecked
+from .machine import COUNTED, SHEETS, TRIED, block
 from .nearest import Grid, Nearest, nearest_in
 from .neighbors import Neighbors, Rows
 from .sheets import cosine_slack
@@ -32,7 +33,6 @@ from .stencils.method import AbstractMethod
 from .stencils.targets import Laplacian
 
 # Rows that are looked at again are taken out so many at a time, their sheets so many.
-_CHUNK, _SHEETS = 256, 16
 # Points whose neighbours reach farther than others' by so many standard deviations wait for that.
 _DEVIATIONS = 3.0
 # What numbers of candidates are rounded up to.
@@ -126,7 +126,9 @@ class NeighborSearch(eqx.Module):
 @sized_jit
 def _candidates(grid, reach: int):
     rows = jnp.arange(len(grid.order), dtype=jnp.int32)
-    return jax.lax.map(lambda i: grid.candidates(i[None], reach, 1)[1][0], rows, batch_size=1024)
+    return jax.lax.map(
+        lambda i: grid.candidates(i[None], reach, 1)[1][0], rows, batch_size=block(COUNTED)
+    )
 
 
 @sized_jit
@@ -266,7 +268,7 @@ def _adapted(search, grid, rings, cloud, lists, laplacian):
 def _for_rows(which, look: Callable, state):
     """Some rows of the arrays of a state, which end with the axis of rows, put in by `look`."""
     n = len(which)
-    chunk = min(_CHUNK, n)
+    chunk = min(block(TRIED), n)
     # A chunk may begin at the last of them.
     rows = jnp.nonzero(which, size=n + chunk, fill_value=n)[0].astype(jnp.int32)
     count = jnp.sum(which)
@@ -341,7 +343,7 @@ def _lists(grid: Grid, rings: _Rings, rows, k: int, tier: Tier) -> _Lists:
         d = len(grid.cells)
         x, normals = jnp.stack(grid.given[:d], axis=1), jnp.stack(grid.given[d:], axis=1)
         find = lambda row: _without_islands(x, normals, rings, k, *row)
-        found = jax.lax.map(find, (rows, candidates.T, good.T), batch_size=_SHEETS)
+        found = jax.lax.map(find, (rows, candidates.T, good.T), batch_size=block(SHEETS))
         return tuple(jnp.where(held, a.T, b) for a, b in zip(found, usual))
 
     indices, mask = jax.lax.cond(jnp.any(held), apart, lambda: usual)

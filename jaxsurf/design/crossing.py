@@ -13,10 +13,11 @@ from jaxtyping import Array, Bool
 
 from ..arguments import switched_off
 from ..cloud import PointCloud
+from ..machine import PAIRS, block_of_pairs
 from ..neighbors import Neighbors
 
 # So many points are looked from, evenly over the list, in blocks of so many.
-_PROBES, _BLOCK = 1_000, 64
+_PROBES = 1_000
 # Neighbours that tell the spacing at a point.
 _RING = 6
 # How far from a half, in turns: less than one, and more than errors of the sum. A sheet that does
@@ -47,7 +48,9 @@ def crosses(cloud: PointCloud, neighbors: Neighbors) -> Bool[Array, ""]:
         return areas @ jnp.where(same, 0, angles)
 
     probes = slice(None, None, max(1, -(-cloud.n // _PROBES)))
-    found = jax.lax.map(turns, (jnp.arange(cloud.n)[probes], x[probes]), batch_size=_BLOCK)
+    found = jax.lax.map(
+        turns, (jnp.arange(cloud.n)[probes], x[probes]), batch_size=block_of_pairs(PAIRS)
+    )
     if on is not None:
         found = switched_off(on[probes], found, jnp.nan)
     turned = found / (2 * jnp.nanmedian(found))

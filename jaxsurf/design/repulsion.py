@@ -16,9 +16,7 @@ from jaxtyping import Array, Float
 
 from ..arguments import instance, switched_off, whole
 from ..discretization import Discretization
-
-# Points whose balls are looked at together.
-_BLOCK = 64
+from ..machine import PAIRS, block_of_pairs
 
 
 def tangent_point_energy(surface: Discretization, *, power: int = 6) -> Float[Array, ""]:
@@ -64,7 +62,7 @@ def _energy(x, normals, areas, power: int):
 
     # Recomputed in reverse mode: nothing of the size of all pairs is kept.
     each = (jnp.arange(len(x)), x, normals, areas)
-    rows = jax.lax.map(jax.checkpoint(seen_from), each, batch_size=_BLOCK)
+    rows = jax.lax.map(jax.checkpoint(seen_from), each, batch_size=block_of_pairs(PAIRS))
     return jnp.sum(rows) / 2**power
 
 
@@ -107,7 +105,7 @@ def _radius(x, normals, on):
     fixed = stop_gradient(x)
     other = lambda one: jnp.argmax(switched_off(on, _bends(one[0], one[1], one[2], fixed), -1))
     each = (jnp.arange(len(x)), fixed, stop_gradient(normals))
-    apart = x[jax.lax.map(other, each, batch_size=_BLOCK)] - x
+    apart = x[jax.lax.map(other, each, batch_size=block_of_pairs(PAIRS))] - x
     squared = _squared(jnp.sum(apart * normals, axis=1), jnp.sum(apart**2, axis=1))
     plane = squared == 0
     return jnp.where(plane, jnp.inf, 1 / jnp.sqrt(jnp.where(plane, 1, squared)))

@@ -18,14 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..compiling import is_quick, namespace
-
-# Up to this number of unknowns a system is small.
-_SMALL = 15
+from ..machine import machine
 
 
 def is_small(unknowns: int) -> bool:
     """Whether a system of so many takes the form that runs faster, and is compiled more slowly."""
-    return unknowns <= _SMALL and not is_quick()
+    return unknowns <= machine().unknowns and not is_quick()
 
 
 def combine(a, v):

@@ -19,12 +19,10 @@ from ..arguments import as_float, finite, instance, real, shaped, switched_off
 from ..compiling import sized_jit
 from ..discretization import Discretization
 from ..failures import check, needs_values, not_positive
+from ..machine import SOLVED
 from ..solve.precondition import AbstractPreconditioner, multigrid
 from ..solve.steady import solve
 from ..stencils.algebra import AbstractOperator
-
-# Columns that are solved for at once.
-_BLOCK = 64
 
 
 class AbstractPrior(eqx.Module):
@@ -190,10 +188,10 @@ def _variance(prior: MaternPrior, n: int):
     mass = switched_off(prior.operator.active, prior.mass, 1)
 
     def of_block(rows):
-        unit = jnp.zeros((n, _BLOCK), mass.dtype).at[rows, jnp.arange(_BLOCK)].set(1 / mass[rows])
+        unit = jnp.zeros((n, SOLVED), mass.dtype).at[rows, jnp.arange(SOLVED)].set(1 / mass[rows])
         columns = prior._solved(unit)
         return jnp.sum(prior.mass[:, None] * columns**2, axis=0) / prior.tau**2
 
-    rows = jnp.arange(-(-n // _BLOCK) * _BLOCK).reshape(-1, _BLOCK)
+    rows = jnp.arange(-(-n // SOLVED) * SOLVED).reshape(-1, SOLVED)
     found = jax.lax.map(of_block, jnp.minimum(rows, n - 1)).reshape(-1)[:n]
     return switched_off(prior.operator.active, found)

@@ -20,11 +20,9 @@ from jaxtyping import Array, Float, PyTree
 
 from ..compiling import sized_jit
 from ..failures import marking
+from ..machine import PUSHED
 from ..time.run import forwards
 from .priors import AbstractPrior
-
-# Rows or columns of the Jacobian that are computed at once.
-_BLOCK = 32
 
 
 def is_prior(x: Any) -> bool:
@@ -211,7 +209,7 @@ def _free_columns(problem, xi):
         )
 
     push = _pushed(residual, flat)
-    return jax.lax.map(push, jnp.eye(flat.size, dtype=flat.dtype), batch_size=_BLOCK).T
+    return jax.lax.map(push, jnp.eye(flat.size, dtype=flat.dtype), batch_size=PUSHED).T
 
 
 @sized_jit
@@ -220,7 +218,7 @@ def _jacobian(problem, xi, rows):
     of_flat = lambda flat: problem.residual(unravel(flat))
     if not rows:
         push = _pushed(of_flat, flat)
-        return jax.lax.map(push, jnp.eye(flat.size, dtype=flat.dtype), batch_size=_BLOCK).T
+        return jax.lax.map(push, jnp.eye(flat.size, dtype=flat.dtype), batch_size=PUSHED).T
     residual, pulled = jax.vjp(of_flat, flat)
     pull = lambda r: pulled(r)[0]
-    return jax.lax.map(pull, jnp.eye(residual.size, dtype=residual.dtype), batch_size=_BLOCK)
+    return jax.lax.map(pull, jnp.eye(residual.size, dtype=residual.dtype), batch_size=PUSHED)

@@ -17,13 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..machine import COLORS
 from ..stencils.padded import PaddedMatrix
 from ..stencils.stencil import prepared
 from .aggregation import damped_step, noise, stretched
 from .reduced import check_kinds
-
-# Colours in one product; their number is a multiple of it, so that few numbers occur.
-_BLOCK = 16
 
 Fields = Float[Array, "n c"]
 
@@ -73,7 +71,7 @@ class Pattern(eqx.Module):
             own = self.color[:, None] == colors
             return apply(jnp.where(own, constant[:, None], 0))
 
-        colors = jnp.arange(self.count, dtype=self.color.dtype).reshape(-1, _BLOCK)
+        colors = jnp.arange(self.count, dtype=self.color.dtype).reshape(-1, COLORS)
         sums = jnp.moveaxis(jax.lax.map(products, colors), 0, 1).reshape(-1, self.count)
         size = jnp.where(constant > 0, constant, 1)
         if self.entries is None or self.transposed is None:
@@ -87,7 +85,7 @@ class Pattern(eqx.Module):
 
 
 def _rounded(count) -> int:
-    return -(-int(count) // _BLOCK) * _BLOCK
+    return -(-int(count) // COLORS) * COLORS
 
 
 def _filled(pattern: PaddedMatrix, entry: Callable[[Array, Array], Array]) -> PaddedMatrix:

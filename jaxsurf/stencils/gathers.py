@@ -17,11 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..arguments import switched_off
 from ..compiling import AnyArray, is_quick, namespace
-
-# Slots added up in one pass over the memory of the result.
-_GROUP = 10
-# Below this many weights of a scalar operator everything is gathered at once, without a loop.
-_SMALL = 50_000
+from ..machine import machine
 
 
 def take(values: Float[AnyArray, "m *c"], j: Int[AnyArray, "..."]) -> Float[AnyArray, "... *c"]:
@@ -86,13 +82,14 @@ def sum_slots(weights, indices, values, contracted: int):
         return total + _term(w, j, values, contracted)
 
     def add_group(i, total):
-        for q in range(_GROUP):
-            total = add(i * _GROUP + q, total)
+        for q in range(size):
+            total = add(i * size + q, total)
         return total
 
     if is_quick():
         return _scan_slots(weights, indices, values, contracted)
-    groups, left = divmod(len(indices), _GROUP)
+    size = machine().slots
+    groups, left = divmod(len(indices), size)
     total = jax.lax.fori_loop(0, groups, add_group, _zero(weights, values, contracted))
     for slot in range(len(indices) - left, len(indices)):
         total = add(slot, total)
@@ -123,7 +120,7 @@ def _all_slots(weights, indices, values, contracted: int):
 
 def constant_product(weights, indices, x):
     """The product of a scalar operator that is a constant for derivatives, quick to compile."""
-    if weights.size < _SMALL and x.ndim == 1:
+    if weights.size < machine().gathered and x.ndim == 1:
         return jnp.sum(weights * take(x, indices), axis=0)
     return _scan_slots(weights, indices, x, 0)
 

@@ -1,0 +1,76 @@
+"""What depends on the machine: how much is treated at once, on CPUs and on accelerators.
+
+What a core of a CPU treats at once has to fit into its caches. An accelerator is busy with hundreds
+of thousands of numbers only, and takes microseconds to begin with anything: loops are short there,
+and on an H200 the stencils of 100,000 points, in blocks for a CPU, took 180 times as long.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+
+# Points of a block on a CPU, see `block`.
+CELLS = 100  # of integrals; no power of two, see `GFDM.batch_size`
+READ = 128  # where fields are interpolated
+FITTED = 256  # whose normals are fitted
+SEARCHED = 512  # whose neighbours are searched
+COUNTED = 1024  # whose candidates are counted
+SHEETS = 16  # with sheets to tell apart
+PAIRS = 64  # that see all others, see `block_of_pairs`
+# Points that a program looks at again, of which few shapes are to be compiled: normals that still
+# move, stencils that are not stable.
+MOVING, TRIED = 4096, 256
+# Blocks that one call treats where arrays are small.
+PIECE = 8
+# Columns at once: right-hand sides, directions of a Jacobian, colours of a product of matrices.
+SOLVED, PUSHED, COLORS = 64, 32, 16
+# Of programs that are compiled quickly on a CPU.
+QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
+
+
+class Machine(NamedTuple):
+    """What suits a kind of machine.
+
+    Args:
+        points: of a block, in units of what suits a CPU.
+        pairs: the same of points that see all others.
+        slots: of an operator, added up in one pass over the memory of the result.
+        gathered: weights of a scalar operator below which everything is gathered at once, without
+            a loop.
+        unknowns: of small systems up to which straight-line code runs faster than a library.
+        quick: numbers given to a program, in all its arrays, below which it is compiled quickly.
+        sorts: whether the compiler's own sorting is faster than a network of exchanges.
+    """
+
+    points: int
+    pairs: int
+    slots: int
+    gathered: int
+    unknowns: int
+    quick: int
+    sorts: bool
+
+
+CPU = Machine(
+    points=1, pairs=1, slots=10, gathered=50_000, unknowns=15, quick=1_750_000, sorts=False
+)
+ACCELERATOR = Machine(
+    points=256, pairs=16, slots=1_000, gathered=1 << 40, unknowns=15, quick=0, sorts=True
+)
+
+
+def machine() -> Machine:
+    """That of JAX's default backend."""
+    return CPU if jax.default_backend() == "cpu" else ACCELERATOR
+
+
+def block(points: int) -> int:
+    """Points that are treated at once where so many of them fit into the caches of a CPU."""
+    return points * machine().points
+
+
+def block_of_pairs(points: int) -> int:
+    """The same of points each of which sees all others."""
+    return points * machine().pairs

@@ -1,0 +1,61 @@
+"""What suits an accelerator gives what suits a CPU gives, whichever machine runs it."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsurf as js
+from jaxsurf import compiling, machine
+
+CLOUD = js.torus(500, 1.0, 0.4)
+# Several blocks, also of so few points.
+SMALL = machine.ACCELERATOR._replace(points=2, pairs=2)
+
+
+def _results():
+    surface = js.discretize(CLOUD, method=js.GFDM(degree=2))
+    x, search, u = surface.cloud.points, surface.search(), jnp.sin(surface.cloud.points[:, 0])
+    lists = jax.jit(lambda x: surface.moved(x, search=search).neighbors)
+
+    def energy(x):
+        there = js.Discretization(surface.cloud, surface.neighbors, surface.method).moved(x)
+        return jnp.mean(there.laplacian(u) ** 2)
+
+    found = {
+        "normals": js.estimate_normals(x),
+        "weights": surface.laplacian.weights,
+        "areas": surface.areas,
+        "field": surface.interpolate(u, 1.001 * x[:50]),
+        "radius": js.medial_radius(surface),
+        "repulsion": js.tangent_point_energy(surface),
+        "lists": lists(1.01 * x),
+        "slope": jax.grad(energy)(1.01 * x),
+    }
+    # As users compile it.
+    token = compiling.quickly.set(False)
+    found["product"] = surface.laplacian(u), surface.gradient(u)
+    compiling.quickly.reset(token)
+    return found
+
+
+@pytest.mark.filterwarnings("ignore:the surface bends")
+def test_the_same_in_the_form_for_accelerators(monkeypatch):
+    expected = _results()
+    jax.clear_caches()
+    monkeypatch.setattr(machine, "CPU", SMALL)
+    found = _results()
+    jax.clear_caches()
+    for name, value in expected.items():
+        for a, b in zip(jax.tree.leaves(found[name]), jax.tree.leaves(value), strict=True):
+            scale = float(np.abs(b).max())
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * scale, err_msg=name)
+
+
+def test_blocks_hold_more_where_there_is_an_accelerator(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert machine.machine() is machine.ACCELERATOR
+    assert machine.block(100) == 100 * machine.ACCELERATOR.points
+    assert machine.block_of_pairs(64) == 64 * machine.ACCELERATOR.pairs

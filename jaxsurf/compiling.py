@@ -77,8 +77,11 @@ def _programs(f: Callable) -> tuple[Callable, Callable]:
         return call
 
     program.__name__ = quick_program.__name__ = f.__name__
-    quick = jax.jit(quick_program, static_argnums=(1, 2), compiler_options=QUICK)
-    return called(jax.jit(program, static_argnums=(1, 2))), called(quick)
+    compiled = functools.cache(
+        lambda: jax.jit(quick_program, static_argnums=(1, 2), compiler_options=_known_options())
+    )
+    quick = called(lambda *args: compiled()(*args))
+    return called(jax.jit(program, static_argnums=(1, 2))), quick
 
 
 def pieces_jit(f: Callable) -> Callable:
@@ -183,16 +186,19 @@ def namespace(a):
 def _takes_longer_to_compile(leaves: list) -> bool:
     """Whether a program of these arguments is taken to be compiled for longer than it runs."""
     small = sum(a.size for a in leaves if is_array(a)) < machine().quick
-    return small and is_concrete(*leaves) and _is_known()
+    return small and is_concrete(*leaves) and bool(_known_options())
 
 
 @functools.cache
-def _is_known() -> bool:
-    if jax.default_backend() != "cpu":
-        return False
+def _known_options() -> dict:
+    """Those to compile quickly with that this jaxlib knows."""
+    return {name: value for name, value in QUICK.items() if _is_known({name: value})}
+
+
+def _is_known(options: dict) -> bool:
     try:
         with at_once():
-            jax.jit(lambda: 0, compiler_options=QUICK)()
+            jax.jit(lambda: 0, compiler_options=options)()
     except (ValueError, RuntimeError):
         return False
     return True

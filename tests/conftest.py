@@ -8,31 +8,10 @@ optimised little, here and in the experiments and notebooks that tests start. Th
 form of stencils that users' own programs have, and what runs on several devices is optimised fully.
 """
 
+import importlib.metadata
 import importlib.util
-import mmap
 import os
 from pathlib import Path
-
-# The last one spares a thread for each of the processes that share the cores.
-QUICK = (
-    "--xla_backend_optimization_level=1",
-    "--xla_cpu_use_fusion_emitters=false",
-    "--xla_cpu_parallel_codegen_split_count=2",
-)
-
-
-def known(flags: tuple[str, ...]) -> list[str]:
-    """Of some flags those that this jaxlib has: any other would end the process."""
-    spec = importlib.util.find_spec("jaxlib")
-    library = Path(spec.origin).with_name("libjax_common.so") if spec and spec.origin else None
-    if library is None or not library.is_file():
-        return []
-    with (
-        library.open("rb") as file,
-        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
-    ):
-        return [flag for flag in flags if content.find(flag[2:].split("=")[0].encode()) >= 0]
-
 
 CACHE = Path(__file__).resolve().parents[1] / ".cache" / "jax"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
@@ -42,7 +21,11 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # Workers share the cores: threads of LAPACK that wait for each other there take most of the time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 _as_users = dict(os.environ)
-os.environ["XLA_FLAGS"] = " ".join([*known(QUICK), os.environ.get("XLA_FLAGS", "")])
+# The last one spares threads where processes share the cores. A flag that is unknown ends them all.
+_quick = ["--xla_backend_optimization_level=1", "--xla_cpu_parallel_codegen_split_count=2"]
+if importlib.metadata.version("jaxlib").startswith("0.10."):
+    _quick.append("--xla_cpu_use_fusion_emitters=false")
+os.environ["XLA_FLAGS"] = " ".join([*_quick, os.environ.get("XLA_FLAGS", "")])
 _optimised_little = dict(os.environ)
 
 import jax

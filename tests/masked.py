@@ -335,7 +335,8 @@ def carried(c: Case):
         found = js.evolve(
             js.Motion(shear), c.surface, fields=c.u, problem=heat, solver=dfx.Heun(), **QUICK
         )
-    return found.clouds[-1].points[c.rows], found.fields[-1]
+    surface, fields = found.rows[-1]
+    return surface.cloud.points[c.rows], fields
 
 
 def thinned(c: Case):

@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from ..report import table as rows_table
 from ..report import write_json
-from . import cases, heat, motion, prompt, shapes
+from . import accelerator, cases, heat, motion, prompt, shapes
 
 # Measured on a 2-core machine of the same kind, one process each: build s and apply ms at 1e5.
 PEERS = {
@@ -27,6 +27,7 @@ PEERS = {
     "DCPSE(order=4)": ("OpenFPM Surface DC-PSE, order 4, k = 47", "107-125", "41"),
 }
 GROUPS: dict[str, ModuleType] = {
+    "accelerator": accelerator,
     "heat": heat,
     "motion": motion,
     "prompt": prompt,
@@ -187,8 +188,8 @@ def main() -> None:
         write_json(options.out / "prompt.json", "prompt", rows, time.perf_counter() - start)
         print(rows_table(rows))
         sys.exit(any(row.holds is False for row in rows))
-    if options.group == "motion":
-        print(motion.summary(results))
+    if options.group in ("accelerator", "motion"):
+        print(GROUPS[options.group].summary(results))
         return
     if options.group == "heat":
         print(json.dumps(results, indent=1))

@@ -109,6 +109,20 @@ def motion(n: int) -> dict:
     return found | {"error": relative_l2(last.fields[-1], decayed(last.clouds[-1].points, 1.0))}
 
 
+def summary(results: list[dict]) -> str:
+    """A table in Markdown."""
+    where = f"{jax.devices()[0].device_kind}, jax {jax.__version__}, float64"
+    lines, errors = [where, "", "| what | first call s | again ms |", "|---|---|---|"], []
+    for r in results:
+        name = ", ".join(f"{a:,}" if isinstance(a, int) else f"`{a}`" for a in r["arguments"])
+        for part, v in r["result"].items():
+            if isinstance(v, dict):
+                lines.append(f"| {name}: {part} | {v['first s']:.1f} | {1e3 * v['s']:.3g} |")
+            else:
+                errors.append(f"{name}: {part} {v:.1e}")
+    return "\n".join([*lines, "", *errors])
+
+
 def plan(quick: bool) -> list[tuple[str, list]]:
     n = 10_000 if quick else 100_000
     todo: list[tuple[str, list]] = [("accelerator.stencils", [name, n]) for name in METHODS]

@@ -41,7 +41,7 @@ class Evolution(eqx.Module):
 
     Args:
         ts: times, `(m,)`.
-        rows: surface and fields at each; after adaptation with rows that are switched off.
+        rows: surface and fields at each, with the rows that are switched off.
         stats: how many steps were taken and refused, how often neighbours were found anew; the
             solver and why.
         changes: of the points, by adaptation and contact: see `history`.
@@ -60,11 +60,13 @@ class Evolution(eqx.Module):
 
     @Kept
     def _seen(self) -> list[tuple[Discretization, PyTree[Array]]]:
-        return self.rows if self.changes is None else [compact(*row) for row in self.rows]
+        off = [surface.cloud.active is not None for surface, _ in self.rows]
+        known = is_concrete(self.ts, [surface.cloud.points for surface, _ in self.rows])
+        return [compact(*row) if some and known else row for some, row in zip(off, self.rows)]
 
     @property
     def surfaces(self) -> list[Discretization]:
-        """The surface at each time; where points were added or merged, those that are on."""
+        """The surface at each time, of the rows that are on (under `jit` of all, see `rows`)."""
         return [surface for surface, _ in self._seen]
 
     @property
@@ -163,7 +165,8 @@ def evolve(
         progress: show a bar.
 
     Returns:
-        `Evolution`: `ts`, `clouds`, `surfaces`, `fields`, `history`.
+        `Evolution`: `ts`; `clouds`, `surfaces` and `fields` at each, of the rows that are on
+        (under `jit` of all); `history`.
 
     Accuracy: in time that of the solver; in space that of the method; in float32 points are within
         1e-5 (`tests/test_moving.py`).

@@ -154,7 +154,7 @@ class Moving(AbstractEvolution):
         velocity = as_float(velocity, name, points.shape).astype(points.dtype)
         if self.faced is None:
             return velocity
-        return self.faced.kept_apart(points, surface.cloud.normals, velocity)
+        return self.faced.kept_apart(points, surface.cloud.normals, surface.shape_tensor, velocity)
 
     def _filled(self, t, surface: Discretization, fields, args, problem) -> PyTree[Array]:
         """Bound entries as conditions say; those of a wave's velocity along the paths of points.

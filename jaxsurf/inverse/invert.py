@@ -24,6 +24,7 @@ from .problem import (
     Problem,
     Seen,
     along,
+    conjugate,
     descent,
     each,
     free_columns,
@@ -35,20 +36,26 @@ from .problem import (
     slope,
 )
 
-# A step is halved so often,
-_HALVINGS = 12
+# A step is shortened so often,
+_SHORTENED = 12
 # until J falls by this share of what its slope promises; differences of J below the second number,
 # which is nothing to a likelihood, are not looked at, as solves leave that much.
 _ARMIJO, _NOTHING = 1e-4, 1e-6
 # What solves in the model leave may end it where so many deviations are left: no error.
 _ROUGH = 0.1
+# A step that goes past the least of J along it, which is there at this share of it or before, is
+# tried again as long as that: else data that the model misses, whose part in the second derivative
+# Gauss and Newton leave out, take steps to and fro. For the same reason steps are conjugate.
+_PAST = 0.75
+# The next step is first tried as long as this one should have been, but not shorter than this.
+_SHARE = 0.1
 # No step may be longer in any part of the white noise: what is likely before the data lies within.
 _LONGEST = 3.0
 # The first step of Gauss and Newton is solved for to this share, later ones better.
 _FORCING = 0.5
 # Unknowns are not told apart where data change by less than this many roots of the last digit.
 _SINGULAR = 10.0
-_COLUMNS = ("energy", "misfit", "gradient", "decrement", "linear_steps", "halved", "seconds")
+_COLUMNS = ("energy", "misfit", "gradient", "decrement", "linear_steps", "shortened", "seconds")
 
 
 class Inversion(eqx.Module):
@@ -61,7 +68,7 @@ class Inversion(eqx.Module):
         misfit: $|(F(\theta) - d) / \sigma|^2$ over the number of data: about 1 where the model
             and the noise are right, above where data are missed, below where noise is fitted.
         history: by names `(steps + 1,)`: `energy`, `misfit`, norm of the `gradient`, `decrement`,
-            `linear_steps`, how often a step was `halved`, `seconds`.
+            `linear_steps`, how often a step was `shortened`, `seconds`.
         converged: whether the tolerance was reached.
         stopped: why it ended.
 
@@ -128,8 +135,8 @@ def solve_inverse(
     posterior density. By default by the method of Gauss and Newton, its steps by conjugate
     gradients with products of the linearised model and its adjoint, solved for the better the
     nearer the minimum is (Eisenstat and Walker 1996), shortened to three deviations of the prior
-    and halved until J falls. The number of linear steps does not grow with the number of unknowns,
-    as the prior preconditions them.
+    and to where a parabola along them says that J is least. The number of linear steps does not
+    grow with the number of unknowns, as the prior preconditions them.
 
     Args:
         forward: $F$, of the unknowns and `args`; returns what is measured, in any pytree. Of
@@ -212,26 +219,30 @@ def _run(problem, theta, optimizer, steps, linear_steps, tol) -> tuple[Inversion
         state = started(optimizer, xi)
     first, forcing, stopped, failed = 0.0, _FORCING, "", False
 
-    def note(size, decrement, linear=0, halved=0):
+    def note(size, decrement, linear=0, shortened=0):
         m = now.residual.size
-        known = (now.energy, jnp.sum(now.residual**2) / m, size, decrement, linear, halved)
+        known = (now.energy, jnp.sum(now.residual**2) / m, size, decrement, linear, shortened)
         for name, x in zip(_COLUMNS, (*known, time.perf_counter() - clock)):
             rows[name].append(float(x))
 
-    linear = halved = 0
+    linear, shortened, before, share = 0, 0, None, 1.0
     while not stopped:
         if optimizer is None:
             step, gradient, falls, linear = newton(
                 problem, xi, np.asarray(forcing), np.asarray(linear_steps)
             )
             size, decrement = size_of(gradient), jnp.sqrt(jnp.maximum(-falls, 0))
+            after = gradient, falls
+            if before is not None:
+                step, falls = conjugate(step, *after, before)
+            before = *after, step
         else:
             step, state = descent(optimizer, problem, xi, now, state)
             size = decrement = size_of(now.gradient)
             falls = None
         first = first or float(size)
         forcing = min(_FORCING, max(float(size) / max(first, 1e-300), 1e-12) ** 0.5)
-        note(size, decrement, linear, halved)
+        note(size, decrement, linear, shortened)
         if float(decrement) <= tol:
             stopped = "converged"
         elif not np.isfinite(float(decrement)):
@@ -241,19 +252,47 @@ def _run(problem, theta, optimizer, steps, linear_steps, tol) -> tuple[Inversion
         if stopped:
             continue
         longest = max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(problem.known(step)))
-        for halved in range(_HALVINGS + 1):
-            scale = 0.5**halved * min(1.0, _LONGEST / max(longest, _LONGEST))
-            there = along(xi, step, scale)
-            then = look(problem, there)
-            bound = np.inf if falls is None else now.energy + _ARMIJO * scale * falls + _NOTHING
-            if np.isfinite(then.energy) and then.energy <= bound:
-                break
-        else:
-            stopped = f"steps were halved {_HALVINGS} times, and none lowers J"
+        scale = min(share, _LONGEST / max(longest, _LONGEST))
+        found, shortened, least = _lower(look, problem, xi, now, step, falls, scale)
+        share = min(max(least, _SHARE), 1.0) if least is not None else share
+        if found is None:
+            stopped = f"steps were shortened {_SHORTENED} times, and none lowers J"
             failed = float(decrement) > _ROUGH
-            continue
-        xi, now = there, then
+        else:
+            xi, now = found
     return _found(problem, xi, now, rows, stopped), failed
+
+
+def _lower(look, problem: Problem, xi, now: Seen, step, falls, scale: float):
+    """Where along a step J is lower, if it is, after how many tries; where it is least, if known.
+
+    Args:
+        falls: the slope of J along the step; None of steps that are taken as they are.
+        scale: how much of the step is tried first.
+    """
+    taken = None
+    for shortened in range(_SHORTENED + 1):
+        there = along(xi, step, scale)
+        then = look(problem, there)
+        if taken is not None:
+            return min(taken, (there, then), key=lambda one: float(one[1].energy)), shortened, scale
+        finite = bool(np.isfinite(then.energy))
+        if finite and falls is None:
+            return (there, then), shortened, None
+        if not finite:
+            scale = scale / 2
+            continue
+        # The parabola with the slope here that has J there.
+        slope, rise = scale * float(falls), float(then.energy - now.energy)
+        known = rise - slope > _NOTHING
+        least = -scale * slope / (2 * max(rise - slope, _NOTHING))
+        if rise > _ARMIJO * slope + _NOTHING:
+            scale = min(max(least, 0.1 * scale), 0.5 * scale)
+        elif known and least < _PAST * scale:
+            taken, scale = (there, then), least
+        else:
+            return (there, then), shortened, least if known else None
+    return None, _SHORTENED, None
 
 
 def _found(problem: Problem, xi, now: Seen, rows, stopped: str) -> Inversion:

@@ -183,6 +183,23 @@ def _newton(problem, xi, tolerance, max_steps):
 
 
 @sized_jit
+def conjugate(step, gradient, falls, before: tuple):
+    """A step made conjugate to that before (Polak and Ribière), where both agree, and its slope.
+
+    Args:
+        falls: the slope along the step.
+        before: the gradient there, the slope along the step of Gauss and Newton there, and the
+            direction that was taken.
+    """
+    there, fell, direction = before
+    share = jnp.maximum((falls - inner(step, there)) / fell, 0)
+    both = along(step, direction, share)
+    slope = inner(both, gradient)
+    good = slope < falls / 2
+    return jax.tree.map(lambda a, b: jnp.where(good, a, b), (both, slope), (step, falls))
+
+
+@sized_jit
 def descent(optimizer, problem, xi, now: Seen, state):
     """Updates by an optimiser of optax, and its state."""
     optimizer = optax.with_extra_args_support(optimizer)

@@ -1,10 +1,12 @@
 r"""Heat with a source on the expanding sphere, in time (paper 002, Section 4.2.1, Table 3).
 
 The relative l2 error at t = 1 of exp(-6 t) x y, by steps of given length. The paper's are of first
-order: points by Euler's move, then eq. 29 on the surface where they are, with the source as a
-reaction $c(t)\,\phi$ at the new time, as it stands there. (As a given function of place and time
-it has errors 1.7 times as large; Table 3 has smaller ones, by a choice that the text does not
-tell.) Ours are IMEX steps of fourth order of points and field together, down to the error of space.
+order: Euler's move of the points, and eq. 29 for the field, of which the scan has lost the levels
+of time. They are those that give the errors of Table 3, of all that may be meant: operators of the
+start of the step, which the paper says are frozen over it, the dilution $\phi\,\nabla\cdot v$
+there, diffusion and reaction $c(t)\,\phi$ of the new field at the new time. (All of it on the
+surface of the end has errors 2.4 times as large.) Ours are IMEX steps of fourth order of points and
+field together, down to the error of space.
 """
 
 from __future__ import annotations
@@ -33,13 +35,13 @@ def first_order(surface: js.Discretization, steps: int, end: float = 1.0):
 
     def step(state, t):
         x, u = state
-        x = x + dt * GROWTH.function(t, surface.moved(x), u, None)
         here, r = surface.moved(x), radius(t + dt)
+        velocity = GROWTH.function(t, here, u, None)
         reaction = -6 + 2 / r + 6 / r**2
-        divergence = here.divergence(0.5 * here.cloud.normals)
-        implicit = 1 + dt * (divergence - reaction) - dt * here.laplacian
-        u = js.solve(implicit, u, preconditioner=js.jacobi(implicit), mean_zero=False).value
-        return (x, u), None
+        diluted = u - dt * here.divergence(velocity) * u
+        implicit = 1 - dt * reaction - dt * here.laplacian
+        u = js.solve(implicit, diluted, preconditioner=js.jacobi(implicit), mean_zero=False).value
+        return (x + dt * velocity, u), None
 
     return jax.lax.scan(step, (start, product(start)), dt * jnp.arange(steps))[0]
 
@@ -69,8 +71,10 @@ def run(quick: bool, out: Path) -> list[Row]:
     for steps in tqdm(numbers, desc="E14, first order"):
         errors.append(_error(*first_order(surface, steps)))
         reference = None if quick else _PAPER[steps]
+        # The paper's have an error of space of 2e-4 beside, of operators of degree 2.
+        bound = None if quick else 1.02 * _PAPER[steps]
         here = setting | {"steps": steps, "way": "Euler's move, implicit step"}
-        rows.append(Row("relative l2 error at t = 1", errors[-1], here, reference, source))
+        rows.append(Row("relative l2 error at t = 1", errors[-1], here, reference, source, bound))
     order = slope(1 / np.array(numbers), errors)
     here = setting | {"way": "Euler's move, implicit step"}
     rows.append(Row("order, at least", order, here, 1.0, source, 0.9, at_least=True))

@@ -1,7 +1,7 @@
 r"""A surface that moves: what a move and a step take in units of a build, memory of a gradient.
 
-The steps are the paper's on the expanding sphere (E13 and E14, `e14_steps.first_order`): points by
-Euler's move, operators built there, an implicit step of the field.
+The steps are the paper's on the expanding sphere (E13 and E14, `e14_steps.first_order`): operators
+built, Euler's move of the points, an implicit step of the field.
 """
 
 from __future__ import annotations

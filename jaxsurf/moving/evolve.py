@@ -120,7 +120,7 @@ def evolve(
     fields: PyTree[Array] = (),
     problem: Callable[[Discretization], AbstractEvolution] | None = None,
     method: AbstractMethod | None = None,
-    saveat: Sequence[float] | None = None,
+    saveat: Sequence[float] | ArrayLike | None = None,
     solver: dfx.AbstractSolver | None = None,
     dt0: ArrayLike | None = None,
     rtol: float = 1e-5,

@@ -61,7 +61,7 @@ class Evolution(eqx.Module):
     @Kept
     def _seen(self) -> list[tuple[Discretization, PyTree[Array]]]:
         off = [surface.cloud.active is not None for surface, _ in self.rows]
-        known = is_concrete(self.ts, [surface.cloud.points for surface, _ in self.rows])
+        known = is_concrete(self.ts, [(surface.cloud.points, u) for surface, u in self.rows])
         return [compact(*row) if some and known else row for some, row in zip(off, self.rows)]
 
     @property

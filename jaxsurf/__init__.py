@@ -132,6 +132,7 @@ from .stencils.method import AbstractMethod as AbstractMethod
 from .stencils.method import Diagnostics as Diagnostics
 from .stencils.rbffd import RBFFD as RBFFD
 from .stencils.stencil import Stencil as Stencil
+from .time.bashforth import AdamsBashforth2 as AdamsBashforth2
 from .time.checkpoint import Checkpoint as Checkpoint
 from .time.explicit import RKC2 as RKC2
 from .time.higher import BiharmonicDiffusion as BiharmonicDiffusion

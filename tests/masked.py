@@ -533,6 +533,7 @@ TABLE = {
     "plot_cloud": Row(picture),
     "integrate": Row(lambda c: diffused(c, solver=dfx.Euler(), dt0=0.002), core=True),
     "RKC2": Row(lambda c: diffused(c, solver=js.RKC2(spectral_radius=300.0))),
+    "AdamsBashforth2": Row(lambda c: diffused(c, solver=js.AdamsBashforth2(), dt0=0.002)),
     "IMEX": Row(lambda c: diffused(c, solver=js.IMEX(order=2)), SOLVED),
     "SDIRK": Row(lambda c: diffused(c, solver=js.SDIRK(order=3)), SOLVED),
     "controller": Row(lambda c: adapted(c, solver=dfx.Tsit5(), atol=0.0), SOLVED, core=True),

@@ -195,3 +195,50 @@ def test_single_precision_stays_single():
         u = dfx.diffeqsolve(term, js.RKC2(), 0.0, 0.5, 0.1, u0).ys[-1]
     assert u.dtype == jnp.float32
     assert float(jnp.linalg.norm(u) / jnp.linalg.norm(u0)) == pytest.approx(np.exp(-1.0), rel=0.02)
+
+
+def bashforth(y0, steps=None, *, dt=None, dtype=jnp.float64):
+    """y'' = -(1 + sin(t)) y of which a solver of eighth order knows the end."""
+    rate = lambda t, y, args: jnp.stack([y[1], -(1 + jnp.sin(t)) * y[0]])
+    with_steps = {} if steps is None else {"stepsize_controller": dfx.StepTo(steps)}
+    term, zero = dfx.ODETerm(rate), jnp.zeros((), dtype)
+    return dfx.diffeqsolve(term, js.AdamsBashforth2(), zero, zero + 2, dt, y0, **with_steps).ys[-1]
+
+
+@pytest.mark.parametrize("spread", [1.0, 1.5], ids=["one length", "several"])
+def test_second_order_from_the_step_before(spread):
+    y0 = jnp.array([1.0, 0.3])
+    rate = lambda t, y, args: jnp.stack([y[1], -(1 + jnp.sin(t)) * y[0]])
+    fine = dfx.PIDController(rtol=1e-12, atol=1e-12)
+    exact = dfx.diffeqsolve(
+        dfx.ODETerm(rate), dfx.Dopri8(), 0.0, 2.0, 0.01, y0, stepsize_controller=fine
+    ).ys[-1]
+    errors = []
+    for count in (40, 80, 160):
+        end = bashforth(y0, 2 * jnp.linspace(0, 1, count + 1) ** spread)
+        errors.append(float(jnp.abs(end - exact).max()))
+    assert errors[-1] < 5e-4
+    assert np.polyfit(np.log([4, 2, 1]), np.log(errors), 1)[0] > 1.9
+
+
+def test_derivatives_of_steps_from_the_step_before():
+    y0, way = jnp.array([1.0, 0.3]), jnp.array([0.6, -0.8])
+    end = jax.jit(lambda y: jnp.sum(bashforth(y, dt=0.05) ** 2))
+    slope = (end(y0 + 1e-5 * way) - end(y0 - 1e-5 * way)) / 2e-5
+    assert float(jax.grad(end)(y0) @ way) == pytest.approx(float(slope), rel=1e-7)
+    several = jax.vmap(lambda y: bashforth(y, dt=0.05))(jnp.stack([y0, 2 * y0]))
+    np.testing.assert_allclose(several[1], 2 * several[0], rtol=1e-12)
+    single = bashforth(y0.astype(jnp.float32), dt=0.05, dtype=jnp.float32)
+    assert single.dtype == jnp.float32
+    np.testing.assert_allclose(single, several[0], atol=1e-5)
+
+
+def test_after_a_jump_the_step_before_tells_nothing():
+    """A step of y' = 1, and one of y' = -1 after it."""
+    solver, y0, one = js.AdamsBashforth2(), jnp.array(0.0), jnp.array(1.0)
+    up, down = (dfx.ODETerm(lambda t, y, args, sign=sign: sign * one) for sign in (1, -1))
+    state = solver.init(up, 0.0, 0.1, y0, None)
+    y1, _, _, state, _ = solver.step(up, 0.0, 0.1, y0, None, state, False)
+    for jumped, expected in ((jnp.array(True), 0.0), (jnp.array(False), 0.2)):
+        end = solver.step(down, 0.1, 0.2, y1, None, state, jumped)[0]
+        assert float(end) == pytest.approx(expected, abs=1e-12)

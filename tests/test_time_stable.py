@@ -73,8 +73,12 @@ def test_the_limit_of_chebyshev_steps_is_where_they_begin_to_grow():
     [
         js.RKC2(), js.RKC2(spectral_radius=300.0), js.IMEX(order=4), dfx.Heun(),
         dfx.HalfSolver(dfx.Euler()), dfx.LeapfrogMidpoint(), dfx.ReversibleHeun(),
+        js.AdamsBashforth2(),
     ],
-    ids=["RKC2", "RKC2, radius given", "IMEX", "Heun", "halves", "leapfrog", "reversible"],
+    ids=[
+        "RKC2", "RKC2, radius given", "IMEX", "Heun", "halves", "leapfrog", "reversible",
+        "Bashforth",
+    ],
 )  # fmt: skip
 def test_amplification_is_what_a_solver_does(solver):
     """The norm of a field after many steps of a linear problem, and the radius of one step."""

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from ..compiling import AnyArray, namespace
+from .bashforth import AdamsBashforth2
 from .chebyshev import SAFETY, Step, nth_stage, stages_of
 from .explicit import RKC2
 from .implicit import IMEX
@@ -120,6 +121,15 @@ class Leapfrog(AbstractAmplification):
         return namespace(z).block([[2 * z, one], [one, 0 * one]])
 
 
+class Bashforth(AbstractAmplification):
+    """Of steps of one length: the state, and the one before."""
+
+    def __call__(self, dt, parts):
+        (z,) = parts
+        one = _one(z)
+        return namespace(z).block([[one + 1.5 * z, -0.5 * z], [one, 0 * one]])
+
+
 class Reversible(AbstractAmplification):
     """Heun's method in its reversible form: the state, and another beside it."""
 
@@ -156,6 +166,8 @@ def amplification_of(solver: dfx.AbstractSolver) -> AbstractAmplification | None
         )  # fmt: skip
     if isinstance(solver, dfx.Euler):
         return Tableau((), (1.0,))
+    if isinstance(solver, AdamsBashforth2):
+        return Bashforth()
     if isinstance(solver, dfx.LeapfrogMidpoint):
         return Leapfrog()
     if isinstance(solver, dfx.ReversibleHeun):

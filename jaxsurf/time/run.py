@@ -195,6 +195,7 @@ def planned(
     elif controller is None:
         controller = dfx.ConstantStepSize()
     _check_tolerances(controller, t0.dtype)
+    _check_estimates(solver, controller)
     saveat = check_saves(dfx.SaveAt(t1=True) if saveat is None else saveat, t0, t1)
     allowed = _allowed(max_steps, saveat, t0, t1, dt0, controller)
     check_coefficients(problem, t0, t1)
@@ -218,6 +219,16 @@ def planned(
     throw = bool(throw) and not concrete and not is_marking()
     run = Run(*parts, allowed, bool(progress), throw)
     return Plan(run, name, f"{name}: given" if why == "given" else why, concrete)
+
+
+def _check_estimates(solver: dfx.AbstractSolver, controller) -> None:
+    """Refuse a choice of steps by errors that are not estimated."""
+    adaptive = isinstance(controller, dfx.AbstractAdaptiveStepSizeController)
+    if adaptive and not isinstance(solver, dfx.AbstractAdaptiveSolver):
+        raise ValueError(
+            f"solver={type(solver).__name__} estimates no error that would choose the steps: pass "
+            "their length as dt0, or the times of all as controller=diffrax.StepTo(...)"
+        )
 
 
 def _check_tolerances(controller: dfx.AbstractStepSizeController, dtype) -> None:

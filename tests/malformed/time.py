@@ -262,6 +262,17 @@ SOLVERS = [
     case("RKC2", "radius negative", lambda: js.RKC2(-1.0), "spectral_radius = -1", "above 0"),
     case("RKC2", "radius NaN", lambda: js.RKC2(nan), "spectral_radius", "nan"),
     case("RKC2", "radius an array", lambda: js.RKC2(np.ones(3)), "spectral_radius", "(3,)"),
+    case("integrate", "no step of Euler's", lambda: integrate(solver=dfx.Euler()), "Euler", "dt0"),
+    case("AdamsBashforth2", "no step", lambda: integrate(solver=js.AdamsBashforth2()), "dt0"),
+    case(
+        "AdamsBashforth2", "a step that is unstable",
+        lambda: integrate(solver=js.AdamsBashforth2(), t1=50.0, dt0=1.0),
+        "AdamsBashforth2 is stable up to", "dt0 = 1",
+    ),
+    case(
+        "AdamsBashforth2", "a step that is no number",
+        lambda: integrate(solver=js.AdamsBashforth2(), dt0=nan), "dt0", "nan",
+    ),
     case("RKC2", "unknown loop", lambda: js.RKC2(loop="fast"), "loop", "'fast'", "checkpointed"),
 ] + [
     case(name, label, lambda make=make, s=settings: make(**s), *words)

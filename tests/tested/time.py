@@ -68,6 +68,14 @@ TESTED: dict[str, dict[str, Entry]] = {
         "float32": f"{_EXPLICIT}::test_single_precision_stays_single",
         "bad input": "malformed",
     },
+    "AdamsBashforth2": {
+        "value": f"{_EXPLICIT}::test_second_order_from_the_step_before",
+        "gradient": f"{_EXPLICIT}::test_derivatives_of_steps_from_the_step_before",
+        "jit": f"{_EXPLICIT}::test_derivatives_of_steps_from_the_step_before",
+        "vmap": f"{_EXPLICIT}::test_derivatives_of_steps_from_the_step_before",
+        "float32": f"{_EXPLICIT}::test_derivatives_of_steps_from_the_step_before",
+        "bad input": "malformed",
+    },
     "IMEX": {
         "value": f"{_IMPLICIT}::test_order_of_steps_that_are_not_stiff",
         "gradient": _STEPS,

@@ -1,0 +1,86 @@
+"""The method of Adams and Bashforth of second order, by which the paper moves points."""
+
+from __future__ import annotations
+
+from typing import ClassVar, NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from .explicit import after_jump
+from .states import dtype_of
+
+
+class _State(NamedTuple):
+    """What one step hands to the next.
+
+    Args:
+        rate: at the current state.
+        before: at that before.
+        length: of the step between them; zero where there was none.
+    """
+
+    rate: PyTree[Array]
+    before: PyTree[Array]
+    length: Float[Array, ""]
+
+
+class AdamsBashforth2(dfx.AbstractSolver):
+    r"""Steps of second order with one evaluation of the rate, from that of the step before.
+
+    $x^+ = x + \Delta t\,v + \tfrac12 \Delta t^2\,(v - v^-) / \Delta t^-$, with the rate $v^-$ and
+    the length $\Delta t^-$ of the step before; the first step, and one after a jump, is Heun's, so
+    that the order is kept from the start. Lengths may differ from step to step, but nothing is
+    estimated that would choose them: pass `dt0` to `js.integrate` or `js.evolve`.
+
+    Accuracy: second order (`tests/test_time_explicit.py`); in float32 to its round-off. Undamped
+    oscillations grow slowly, with the fourth power of the step.
+    Differentiable: forward and reverse, in the state and everything the rate depends on.
+    Raises:
+        ValueError: by `js.integrate` and `js.evolve`, where no length of the steps is given, or one
+            that is unstable.
+    Source: Suchde and Kuhnert 2019, eq. (3), who begin with a step of Euler's.
+
+    Example:
+        >>> spin = js.Motion(lambda t, surface, fields, args: jnp.cross(
+        ...     jnp.array([0.0, 0.0, 1.0]), surface.cloud.points))
+        >>> x = js.sphere(300)
+        >>> end = js.evolve(spin, x, t1=2 * jnp.pi, solver=js.AdamsBashforth2(), dt0=0.05)
+        >>> bool(jnp.abs(end.clouds[-1].points - x.points).max() < 0.01)
+        True
+    """
+
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar = dfx.ThirdOrderHermitePolynomialInterpolation
+
+    def order(self, terms):
+        return 2
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+    def init(self, terms, t0, t1, y0, args):
+        rate = terms.vf(t0, y0, args)
+        return _State(rate, rate, jnp.zeros((), dtype_of(y0)))
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        rate = after_jump(made_jump, solver_state.rate, lambda: terms.vf(t0, y0, args))
+        span, length = terms.contr(t0, t1), jnp.asarray(t1 - t0, solver_state.length.dtype)
+        moved = lambda rate: jax.tree.map(jnp.add, y0, terms.prod(rate, span))
+        ahead = moved(rate)
+        first = jnp.asarray(made_jump) | (solver_state.length == 0)
+
+        def start():
+            after = terms.vf(t1, ahead, args)
+            return jax.tree.map(lambda a, b: (a + b) / 2, rate, after)
+
+        def extrapolated():
+            ratio = length / jnp.where(first, 1, solver_state.length) / 2
+            return jax.tree.map(lambda a, b: a + ratio * (a - b), rate, solver_state.before)
+
+        y1 = moved(jax.lax.cond(first, start, extrapolated))
+        after = terms.vf(t1, y1, args)
+        dense = dict(y0=y0, y1=y1, k0=terms.prod(rate, span), k1=terms.prod(after, span))
+        return y1, None, dense, _State(after, rate, length), dfx.RESULTS.successful

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxsurf as js
+from jaxsurf import machine
 from jaxsurf.renew import usual_lists
 
-from ..expanding import GROWTH, decayed, heat, product
 from ..report import relative_l2
-from .cases import METHODS
+from . import motion as moving
+from .cases import METHODS, laplacian, sphere
 from .timing import first_and_median
 
 _AXIS = np.array([1.0, 2.0, 1.5])
@@ -24,12 +25,6 @@ def _timed(call: Callable, repeats: int = 5) -> dict:
     return {"first s": first, "s": seconds}
 
 
-def _sphere(name: str, n: int):
-    method, k = METHODS[name]
-    cloud = js.sphere(n)
-    return cloud, js.find_neighbors(cloud, k=k, throw=False), method
-
-
 def _field(points):
     """A field on the unit sphere and its Laplacian."""
     s = points @ _AXIS
@@ -38,11 +33,10 @@ def _field(points):
 
 def stencils(name: str, n: int) -> dict:
     """Stencils of the Laplacian, its product with a field, and a gradient in points and normals."""
-    cloud, neighbors, method = _sphere(name, n)
+    method, k = METHODS[name]
+    cloud, neighbors = sphere(n, k)
     u, exact = _field(cloud.points)
-    of = lambda points, normals: js.laplace_beltrami(
-        js.PointCloud(points, normals), neighbors, method=method, throw=False
-    )
+    of = lambda points, normals: laplacian(js.PointCloud(points, normals), neighbors, method)
     weights = jax.jit(lambda points, normals: of(points, normals).weights)
     energy = jax.jit(lambda points, normals: jnp.mean(of(points, normals)(u) ** 2))
     gradient = jax.jit(jax.grad(energy, argnums=(0, 1)))
@@ -61,6 +55,12 @@ def stencils(name: str, n: int) -> dict:
         "error": relative_l2(operator(u), exact),
         "gradient's error": float(abs(jnp.vdot(slope, step) / difference - 1)),
     }
+
+
+def in_blocks_for_a_cpu(name: str, n: int) -> dict:
+    """The same as an accelerator would take it without sizes of its own."""
+    machine.ACCELERATOR = machine.CPU._replace(quick=0)
+    return stencils(name, n)
 
 
 def moved(n: int) -> dict:
@@ -100,13 +100,8 @@ def solve(n: int) -> dict:
 
 def motion(n: int) -> dict:
     """Heat on the expanding sphere by `js.evolve` to t = 1."""
-    surface = js.discretize(js.sphere(n), method=js.GFDM(degree=2))
-    start, ends = product(surface.cloud.points), []
-    given = dict(fields=start, problem=heat, solver=js.IMEX(order=4), dt0=1 / 32)
-    whole = lambda: ends.append(js.evolve(GROWTH, surface, t1=1.0, **given))  # type: ignore[arg-type]
-    found = {"evolve": _timed(whole, 1)}
-    last = ends[-1]
-    return found | {"error": relative_l2(last.fields[-1], decayed(last.clouds[-1].points, 1.0))}
+    found = moving.run(n)
+    return {"evolve": {name: found[name] for name in ("first s", "s")}, "error": found["error"]}
 
 
 def summary(results: list[dict]) -> str:
@@ -114,7 +109,11 @@ def summary(results: list[dict]) -> str:
     where = f"{jax.devices()[0].device_kind}, jax {jax.__version__}, float64"
     lines, errors = [where, "", "| what | first call s | again ms |", "|---|---|---|"], []
     for r in results:
-        name = ", ".join(f"{a:,}" if isinstance(a, int) else f"`{a}`" for a in r["arguments"])
+        name = (
+            r["case"].partition(".")[2]
+            + " "
+            + ", ".join(f"{a:,}" if isinstance(a, int) else f"`{a}`" for a in r["arguments"])
+        )
         for part, v in r["result"].items():
             if isinstance(v, dict):
                 lines.append(f"| {name}: {part} | {v['first s']:.1f} | {1e3 * v['s']:.3g} |")
@@ -126,5 +125,6 @@ def summary(results: list[dict]) -> str:
 def plan(quick: bool) -> list[tuple[str, list]]:
     n = 10_000 if quick else 100_000
     todo: list[tuple[str, list]] = [("accelerator.stencils", [name, n]) for name in METHODS]
+    todo += [("accelerator.in_blocks_for_a_cpu", ["GFDM(degree=2)", n])]
     todo += [(f"accelerator.{name}", [n]) for name in ("moved", "solve")]
     return [*todo, ("accelerator.motion", [n // 3])]

@@ -25,12 +25,12 @@ METHODS = {
 }
 
 
-def _sphere(n: int, k: int):
+def sphere(n: int, k: int):
     cloud = js.sphere(n)
     return cloud, js.find_neighbors(cloud, k=k, throw=False)
 
 
-def _laplacian(cloud, neighbors, method):
+def laplacian(cloud, neighbors, method):
     return js.laplace_beltrami(cloud, neighbors, method=method, throw=False)
 
 
@@ -45,8 +45,8 @@ def bandwidth() -> dict:
 
 def apply(n: int, k: int) -> dict:
     """Applying a Laplacian, beside the product with SciPy's CSR matrix and the bandwidth."""
-    cloud, neighbors = _sphere(n, k)
-    operator = _laplacian(cloud, neighbors, js.GFDM(degree=2))
+    cloud, neighbors = sphere(n, k)
+    operator = laplacian(cloud, neighbors, js.GFDM(degree=2))
     # All k entries of a row, as the operator has them; those beyond the support are zero, and
     # SciPy is also shown without them.
     columns, data = (np.asarray(a).T.ravel() for a in (operator.indices, operator.weights))
@@ -72,10 +72,10 @@ def apply(n: int, k: int) -> dict:
 def build(name: str, n: int) -> dict:
     """Building the Laplacian for given neighbours; the first call compiles."""
     method, k = METHODS[name]
-    cloud, neighbors = _sphere(n, k)
+    cloud, neighbors = sphere(n, k)
     before = peak_gib()
     first, seconds = first_and_median(
-        lambda: _laplacian(cloud, neighbors, method).weights, 3 if n > 2e5 else 5
+        lambda: laplacian(cloud, neighbors, method).weights, 3 if n > 2e5 else 5
     )
     return {"build s": seconds, "first call s": first - seconds,
             "peak GiB": peak_gib(), "GiB before": before}  # fmt: skip
@@ -83,11 +83,11 @@ def build(name: str, n: int) -> dict:
 
 def build_beside_numpy(degree: int, k: int, n: int) -> dict:
     """The same GFDM stencil by batched NumPy, all points at once and in blocks, in turn."""
-    cloud, neighbors = _sphere(n, k)
+    cloud, neighbors = sphere(n, k)
     points, normals, index = (
         np.asarray(a) for a in (cloud.points, cloud.normals, neighbors.indices)
     )
-    ours = lambda: _laplacian(cloud, neighbors, js.GFDM(degree=degree)).weights
+    ours = lambda: laplacian(cloud, neighbors, js.GFDM(degree=degree)).weights
     expected = numpy_gfdm(points, normals, index, degree)
     np.testing.assert_allclose(ours().T, expected, rtol=1e-6, atol=1e-8 * np.abs(expected).max())
     found = {}
@@ -128,8 +128,8 @@ def build_beside_compadre(degree: int, threads: int, n: int) -> dict:
 
     def beside(name: str) -> dict:
         method, k = METHODS[name]
-        cloud, neighbors = _sphere(n, k)
-        ours = lambda: _laplacian(cloud, neighbors, method)
+        cloud, neighbors = sphere(n, k)
+        ours = lambda: laplacian(cloud, neighbors, method)
         seconds, theirs, ratio = side_by_side(
             lambda: ours().weights, lambda: gmls.generateAlphas(1, False), 3
         )
@@ -151,13 +151,13 @@ def build_beside_compadre(degree: int, threads: int, n: int) -> dict:
 
 def build_beside_plain_jax(n: int) -> dict:
     """GFDM of degree 2 in a few lines of plain JAX: building, and the gradient in the points."""
-    cloud, neighbors = _sphere(n, 20)
+    cloud, neighbors = sphere(n, 20)
     u = jnp.sin(cloud.points @ jnp.array([1.0, 2.0, 1.5]))
     index = neighbors.indices
 
     def total_ours(x):
         cloud_x = js.PointCloud(x, cloud.normals)
-        return jnp.sum(_laplacian(cloud_x, neighbors, js.GFDM(degree=2))(u) ** 2)
+        return jnp.sum(laplacian(cloud_x, neighbors, js.GFDM(degree=2))(u) ** 2)
 
     def total_plain(x):
         weights = plain_jax_gfdm(x, cloud.normals, index, 2)
@@ -165,7 +165,7 @@ def build_beside_plain_jax(n: int) -> dict:
 
     plain = jax.jit(lambda: plain_jax_gfdm(cloud.points, cloud.normals, index, 2))
     build_ours, build_plain, _ = side_by_side(
-        lambda: _laplacian(cloud, neighbors, js.GFDM(degree=2)).weights, plain, 5
+        lambda: laplacian(cloud, neighbors, js.GFDM(degree=2)).weights, plain, 5
     )
     ours, theirs = (jax.jit(jax.grad(f)) for f in (total_ours, total_plain))
     grad_ours, grad_plain, _ = side_by_side(
@@ -178,11 +178,11 @@ def build_beside_plain_jax(n: int) -> dict:
 def gradient(name: str, n: int, reverse: bool) -> dict:
     """A scalar of the operator, or its gradient in points and normals."""
     method, k = METHODS[name]
-    cloud, neighbors = _sphere(n, k)
+    cloud, neighbors = sphere(n, k)
     u = jnp.sin(cloud.points @ jnp.array([1.0, 2.0, 1.5]))
 
     def total(points, normals):
-        operator = _laplacian(js.PointCloud(points, normals), neighbors, method)
+        operator = laplacian(js.PointCloud(points, normals), neighbors, method)
         return jnp.sum(operator(u) ** 2)
 
     f = jax.jit(jax.grad(total, argnums=(0, 1)) if reverse else total)
@@ -198,14 +198,14 @@ def gradient(name: str, n: int, reverse: bool) -> dict:
 
 def retraces() -> dict:
     """How often two calls of the same shape trace the operator."""
-    cloud, neighbors = _sphere(2000, 26)
+    cloud, neighbors = sphere(2000, 26)
     count = 0
 
     @jax.jit
     def apply(points):
         nonlocal count
         count += 1
-        return _laplacian(js.PointCloud(points, cloud.normals), neighbors, js.DCPSE())(points)
+        return laplacian(js.PointCloud(points, cloud.normals), neighbors, js.DCPSE())(points)
 
     apply(cloud.points)
     apply(1.1 * cloud.points)

@@ -197,21 +197,23 @@ def test_single_precision_stays_single():
     assert float(jnp.linalg.norm(u) / jnp.linalg.norm(u0)) == pytest.approx(np.exp(-1.0), rel=0.02)
 
 
+def swing(t, y, args):
+    """y'' = -(1 + sin(t)) y."""
+    return jnp.stack([y[1], -(1 + jnp.sin(t)) * y[0]])
+
+
 def bashforth(y0, steps=None, *, dt=None, dtype=jnp.float64):
-    """y'' = -(1 + sin(t)) y of which a solver of eighth order knows the end."""
-    rate = lambda t, y, args: jnp.stack([y[1], -(1 + jnp.sin(t)) * y[0]])
     with_steps = {} if steps is None else {"stepsize_controller": dfx.StepTo(steps)}
-    term, zero = dfx.ODETerm(rate), jnp.zeros((), dtype)
+    term, zero = dfx.ODETerm(swing), jnp.zeros((), dtype)
     return dfx.diffeqsolve(term, js.AdamsBashforth2(), zero, zero + 2, dt, y0, **with_steps).ys[-1]
 
 
 @pytest.mark.parametrize("spread", [1.0, 1.5], ids=["one length", "several"])
 def test_second_order_from_the_step_before(spread):
     y0 = jnp.array([1.0, 0.3])
-    rate = lambda t, y, args: jnp.stack([y[1], -(1 + jnp.sin(t)) * y[0]])
     fine = dfx.PIDController(rtol=1e-12, atol=1e-12)
     exact = dfx.diffeqsolve(
-        dfx.ODETerm(rate), dfx.Dopri8(), 0.0, 2.0, 0.01, y0, stepsize_controller=fine
+        dfx.ODETerm(swing), dfx.Dopri8(), 0.0, 2.0, 0.01, y0, stepsize_controller=fine
     ).ys[-1]
     errors = []
     for count in (40, 80, 160):

@@ -292,7 +292,7 @@ def _lower(look, problem: Problem, xi, now: Seen, step, falls, scale: float):
             taken, scale = (there, then), least
         else:
             return (there, then), shortened, least if known else None
-    return None, _SHORTENED, None
+    return taken, _SHORTENED, None
 
 
 def _found(problem: Problem, xi, now: Seen, rows, stopped: str) -> Inversion:

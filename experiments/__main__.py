@@ -125,6 +125,10 @@ EXPERIMENTS = {
         "neck",
         "Mean curvature flow of a smooth dumbbell: the radius of its neck until it pinches off",
     ),
+    "neural-bunny": (
+        "neural_bunny",
+        "Shapes: a neural level set of the bunny's scan, with the scan's first eigenvalues",
+    ),
     "noise": (
         "noise",
         "Study: noise of 1 to 10 % of the spacing: normals, curvature, Laplacians, solutions",

@@ -20,6 +20,7 @@ SIZES = {
     "hear-the-shape": (3_000, 800),
     "hot-spot": (2_000, 600),
     "control": (1_000, 300),
+    "neural-bunny": (4_000, 4_000),
     "conductivity": (4_000, 1_000),
     "vesicles": (1_500, 600),
     "extremal-eigenvalue": (2_000, 600),

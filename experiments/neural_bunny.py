@@ -204,7 +204,7 @@ def problem(n: int):
         off = (values(shape(theta)) / wanted - 1) / _OFF
         return jnp.mean(off**2) + (_MOVE / _FAR) ** 2 * jnp.sum(theta**2)
 
-    return misfit, bunny.start
+    return misfit, bunny.start + 0.1
 
 
 def _picture(path: Path, scanned, surface, errors) -> None:

@@ -168,6 +168,19 @@ def test_derivatives_of_cells_of_many_sides():
     check_derivatives(lambda x: jnp.sum(sizes(x) ** 2), x)
 
 
+@pytest.mark.filterwarnings("ignore:the surface bends")
+def test_derivatives_where_the_surface_bends_within_a_cell():
+    """By two Newton steps, as many as others need, to where cells end they were 1e-4 off."""
+    surface = js.discretize(js.ellipsoid(200, (1, 0.5, 0.25)), method=js.GFDM(degree=2))
+    cloud, weights = surface.cloud, jnp.asarray(np.random.default_rng(0).normal(size=200))
+
+    def total(points):
+        moved = js.PointCloud(points, cloud.normals)
+        return weights @ js.Discretization(moved, surface.neighbors, surface.method).areas
+
+    check_derivatives(total, cloud.points)
+
+
 def test_derivatives_of_integrals():
     """Area, volume and the integral of a field, in points and normals, to 1e-6.
 
@@ -186,7 +199,8 @@ def test_derivatives_of_integrals():
         fields = jnp.stack([points[:, 0] ** 2, height, jnp.sin(3 * points[:, 0])], axis=1)
         return surface.integrate(fields)
 
-    check_derivatives(total, rough, cloud.normals, step=1e-4)
+    # One of them, of the normals, is so small that shorter steps see round-off.
+    check_derivatives(total, rough, cloud.normals, step=5e-4)
 
 
 def test_interpolation():

@@ -21,9 +21,10 @@ from .graph import Graph, polynomial
 from .monomials import monomials_by_degree, polynomial_count
 from .plane import TangentPlane
 
-# Newton steps from cells with straight sides to those on the surface: each squares what is left of
-# an error of the size (spacing x curvature)^2.
-_STEPS = 2
+# Newton steps from cells with straight sides to those on the surface end with one as small as this,
+# or after so many: each squares what is left of an error of the size (spacing x curvature)^2. The
+# derivative is off by what is left.
+_SMALL, _STEPS = 1e-4, 8
 # Sides that it puts so much farther out than straight ones, or behind the point, are not found.
 _STRETCH = 2.0
 # Of the neighbours that are tried so many are its sides at most, or half of them.
@@ -111,15 +112,16 @@ def _over_sides(these: Sides, those: Sides, graph: Graph):
         return q - _meeting(u, v, *jax.lax.stop_gradient((a, b)))
 
     straight = _meeting(these.offset, those.offset, these.flat, those.flat)
-    corners = _root(newton, jax.lax.stop_gradient(straight), these, those, graph)
+    corners, lost = _root(newton, straight, these, those, graph)
     first, last = corners[:, :-1], corners[:, 1:]
     turn = first[0] * last[1] - first[1] * last[0]
     share, weights = _gauss(_nodes(graph), 0)
     ends = jnp.concatenate([first + x * (last - first) for x in share], axis=1)
     again = jax.tree.map(lambda a: jnp.concatenate([a[..., 1:, :]] * len(share), axis=-2), these)
     found, reach = _along_ways(again, graph, ends, jnp.concatenate([w * turn for w in weights]))
-    corners = jnp.max(jnp.sum(jax.lax.stop_gradient(corners) ** 2, axis=0), axis=0)
-    return found, jnp.maximum(corners, reach)
+    far = jnp.sum(jax.lax.stop_gradient(corners) ** 2, axis=0)
+    far = jnp.where(jnp.any(lost, axis=0), jnp.inf, far)
+    return found, jnp.maximum(jnp.max(far, axis=0), reach)
 
 
 def _along_ways(sides: Sides, graph: Graph, ends, measure):
@@ -138,7 +140,7 @@ def _along_ways(sides: Sides, graph: Graph, ends, measure):
         rate = jax.lax.stop_gradient(jnp.sum(slope * ends, axis=0))
         return length - beyond / jnp.where(rate > 0, rate, 1)
 
-    length = _root(newton, jnp.ones_like(measure), sides, graph, ends)
+    length, lost = _root(newton, jnp.ones_like(measure), sides, graph, ends)
     ends = length * ends
     measure = measure * length**graph.dim
 
@@ -153,7 +155,7 @@ def _along_ways(sides: Sides, graph: Graph, ends, measure):
     sums = jnp.tensordot(powers * share, jnp.sqrt(square), 1) * measure
     found = [jnp.sum(row * total, axis=1) for row, total in zip(rows, sums)]
     length, ends = jax.lax.stop_gradient((length, ends))
-    resolved = (length > 0) & (length < _STRETCH)
+    resolved = (length > 0) & (length < _STRETCH) & ~lost
     reach = jnp.where(resolved, jnp.sum(ends**2, axis=0), jnp.inf)
     # The line of a border passes through the point: there is nothing between them.
     reach = jnp.where(sides.offset > 0, reach, 0)
@@ -237,11 +239,23 @@ def _ways_of_curve(sides: Sides):
 
 
 def _root(newton: Callable, start, *known):
-    """The end of some Newton steps, of which the last has the derivative of the root."""
-    fixed = jax.lax.stop_gradient(known)
-    near = jax.lax.fori_loop(0, _STEPS, lambda _, x: newton(x, *fixed), start)
+    """The end of Newton's method, of which the last step has the derivative of the root.
+
+    And where it was lost: the value is then that of one step.
+    """
+    fixed, start = jax.lax.stop_gradient((known, start))
+
+    def step(state):
+        count, x, _ = state
+        new = newton(x, *fixed)
+        return count + 1, new, jnp.max(jnp.abs(new - x))
+
+    moves = lambda state: (state[0] < _STEPS) & ~(state[2] < _SMALL)
+    near = jax.lax.while_loop(moves, step, step((0, start, None)))[1]
+    lost = ~(jnp.abs(near - start) < _STRETCH * (1 + jnp.abs(start)))
+    near = jax.lax.stop_gradient(jnp.where(lost, start, near))
     # Without the barrier the compiler finds the value again for every use of it.
-    return jax.lax.optimization_barrier(newton(jax.lax.stop_gradient(near), *known))
+    return jax.lax.optimization_barrier(newton(near, *known)), lost
 
 
 @functools.cache

@@ -227,8 +227,9 @@ def _picture(path: Path, scanned, surface, errors) -> None:
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    # With fewer points lists at the ears are too short.
-    n, more = (10_000, 12_000) if quick else (12_000, 24_000)
+    # With so few points as in the quick form lists at the ears are short, and the last sampling of
+    # the same size may see another bunny: the finer one tells.
+    n, more = (4_000, 8_000) if quick else (12_000, 24_000)
     training, steps = (_ROUGHLY, 2) if quick else ((10_000, 256), 5)
     clock = time.perf_counter()
     bunny = Bunny(*training)
@@ -255,14 +256,14 @@ def run(quick: bool, out: Path) -> list[Row]:
     _picture(out / "neural-bunny.png", js.discretize(scanned, method=_METHOD), fine, errors)
     about = {"n": n, "eigenvalues": _COUNT, "directions": _DIRECTIONS}
     finer = about | {"n": more}
-    bound = 3e-2 if quick else 1e-2
+    bound = 7e-2 if quick else 1e-2
     distance = "distance of the scan's points, rms over the diagonal of their box"
     return [
         Row("largest relative error of an eigenvalue before", largest(errors[0]), about),
         Row("largest relative error of an eigenvalue", largest(errors[-1]), about, 0.0, "scan",
-            bound),
-        Row("the same on a finer sampling", largest(relative(values(fine))), finer, 0.0, "scan",
             None if quick else bound),
+        Row("the same on a finer sampling", largest(relative(values(fine))), finer, 0.0, "scan",
+            bound),
         Row("the same there by collocation of order 4", largest(relative(collocated)), finer, 0.0,
             "scan", None if quick else bound),
         Row(f"{distance}, before", before, about),

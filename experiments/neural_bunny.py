@@ -159,6 +159,13 @@ def linearised(shape: js.LevelSetShape, theta):
     return found, jax.lax.map(lambda row: pulled(row)[0], jnp.eye(_COUNT))
 
 
+def discretized(cloud: js.PointCloud, method) -> js.Discretization:
+    """With lists that end at rims of ears."""
+    k = method.neighbor_count(3)
+    lists = js.find_neighbors(cloud, k, min_cosine=_COSINE, throw=False)
+    return js.discretize(cloud, lists, method=method)
+
+
 class Bunny:
     """The data, a network fitted to them, and the family of level sets around it."""
 
@@ -171,16 +178,14 @@ class Bunny:
         weights, tree = ravel_pytree(weights)
         phi = lambda x, weights: eqx.combine(tree(weights), rest)(x)
         some = np.random.default_rng(0).choice(len(self.points), _CHOSEN_AT, replace=False)
-        along = directions(phi, weights, jnp.asarray(self.points[some]))
-        along = _MOVE * self.scale * along
+        largest = directions(phi, weights, jnp.asarray(self.points[some]))
+        along = _MOVE * self.scale * largest
         self.phi = lambda x, theta: phi(x, weights + along @ theta)
         self.start = jnp.zeros(_DIRECTIONS)
 
     def sampled(self, theta, n: int) -> js.Discretization:
         cloud = js.level_set(lambda x: self.phi(x, theta), n=n, bounds=self.bounds)
-        k = _METHOD.neighbor_count(3)
-        lists = js.find_neighbors(cloud, k, min_cosine=_COSINE, throw=False)
-        return js.discretize(cloud, lists, method=_METHOD)
+        return discretized(cloud, _METHOD)
 
     def shape(self, theta, n: int) -> js.LevelSetShape:
         return js.LevelSetShape(self.phi, self.sampled(theta, n))
@@ -247,9 +252,7 @@ def run(quick: bool, out: Path) -> list[Row]:
     relative = lambda values: np.asarray(values / wanted - 1)
     errors.append(relative(values(bunny.sampled(theta, n))))
     largest = lambda error: float(np.abs(error).max())
-    other = js.GFDM(degree=4)
-    lists = js.find_neighbors(fine.cloud, other.neighbor_count(3), min_cosine=_COSINE, throw=False)
-    other = js.discretize(fine.cloud, lists, method=other)
+    other = discretized(fine.cloud, js.GFDM(degree=4))
     collocated = js.eigenmodes(other.laplacian, _COUNT + 1).values[1:]
     cloud = data.bunny(4_000)
     scanned = js.PointCloud(cloud.points, cloud.normals, boundary=cloud.boundary)

@@ -24,8 +24,8 @@ _RADIUS, _TIME = 0.5, 0.1
 _BOUND, _DEFAULT = 1e-5, 1e-4
 # Of the reference, and of one to compare it with.
 _DEGREE, _COARSE = 12, 8
-# Methods, and neighbours of each point where these are fewer than the method asks for: errors on
-# even points fall with the square of their number.
+# Methods, and neighbours of each point where these are fewer than the method asks for, to be stable
+# on uneven points too.
 _METHODS: list[tuple[Method, int | None]] = [
     (js.GFDM(degree=4), None),
     (js.GFDM(degree=4), 37),

@@ -125,13 +125,10 @@ def matrices(reference: Reference, F: Callable, theta) -> Matrices:
 
 
 def functionals(
-    reference: Reference, F: Callable, theta, direction, fields: dict, first: int, last: int,
-    time: float,
-) -> dict[str, tuple[float, float]]:  # fmt: skip
-    r"""Values and derivatives along a direction.
-
-    The heat content is $w^T e^{-tA} s$ with $A = M^{-1} K$; the derivative of the exponential has
-    divided differences of $e^{-t\lambda}$ between the modes of A (Daleckii and Krein).
+    reference: Reference, F: Callable, theta, directions: list, fields: dict, first: int,
+    last: int, time: float,
+) -> list[dict[str, tuple[float, float]]]:  # fmt: skip
+    """Values and derivatives along each of the directions.
 
     Args:
         fields: "load", "start" and "weight" as functions of points of the reference.
@@ -141,9 +138,21 @@ def functionals(
     along = jax.jit(
         lambda theta, dot: jax.jvp(lambda t: matrices(reference, F, t), (theta,), (dot,))
     )
-    m, dm = (jax.tree.map(np.asarray, part) for part in along(theta, direction))
     nodes = {name: np.asarray(jax.vmap(f)(reference.points)) for name, f in fields.items()}
     basis = np.asarray(jax.vmap(reference.basis)(reference.points))
+    return [
+        _along(*jax.tree.map(np.asarray, along(theta, dot)), nodes, basis, slice(first, last + 1),
+               time)
+        for dot in directions
+    ]  # fmt: skip
+
+
+def _along(m: Matrices, dm: Matrices, nodes: dict, basis, group: slice, time: float) -> dict:
+    r"""Values and derivatives from matrices and theirs.
+
+    The heat content is $w^T e^{-tA} s$ with $A = M^{-1} K$; the derivative of the exponential has
+    divided differences of $e^{-t\lambda}$ between the modes of A (Daleckii and Krein).
+    """
     rates, modes = scipy.linalg.eigh(m.stiffness, m.mass)
     # The derivative of A between modes.
     mixed = modes.T @ dm.stiffness @ modes - (modes.T @ dm.mass @ modes) * rates
@@ -167,7 +176,6 @@ def functionals(
         near, -time * fall[:, None], (fall[:, None] - fall) / np.where(near, 1, apart)
     )
     seen = weight @ modes
-    group = slice(first, last + 1)
     return {
         "area": (m.areas.sum(), dm.areas.sum()),
         "volume": (m.areas @ height / 3, (dm.areas @ height + m.areas @ rise) / 3),

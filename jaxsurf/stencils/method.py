@@ -51,7 +51,8 @@ class Diagnostics(eqx.Module):
     def of(cls, around: Neighborhood, condition, residual, support, layers: int) -> Diagnostics:
         """Diagnostics of one stencil: what the solve tells, and what its geometry does."""
         r2 = around.squared
-        inside = around.mask & (r2 < support**2)
+        # The farthest too, where a method takes its distance as the support.
+        inside = around.mask & (r2 < (1 + 8 * jnp.finfo(r2.dtype).eps) * support**2)
         return cls(
             condition,
             residual,

@@ -71,8 +71,7 @@ class RBFFD(AbstractMethod):
         error, size = (jnp.max(jnp.abs(v[..., k:, :]), (-2, -1)) for v in (a @ solution - b, b))
         eta = jnp.moveaxis(solution[..., :k, :], (-1, -2), (0, 1))
         eta = with_center(target.in_units(eta, unit, len(x)))
-        reach = unit * (1 + 4 * jnp.finfo(unit.dtype).eps)  # of a support that holds the farthest
-        diagnostics = Diagnostics.of(neighborhood, condition, error / size, reach, 0)
+        diagnostics = Diagnostics.of(neighborhood, condition, error / size, unit, 0)
         return target.assemble(eta, jnp.moveaxis(tangents, (-2, -1), (0, 1))), diagnostics
 
 

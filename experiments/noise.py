@@ -4,7 +4,8 @@ On a torus, where all is known, and on the bunny, where the reference is what th
 of the same points without noise. Points are moved in all directions; normals are estimated from
 the moved points, by fits of the degree of the method to as many points as it has neighbours. The
 field is $e^{(x + 2y + 1.5z)/s}$ in space; its values stay those at the points without noise. The
-solution is that of $u - \ell^2 \Delta_S u = f$, $\ell$ a tenth of the size: a step of heat.
+solution is that of $u - \ell^2 \Delta_S u = f$, $\ell$ a tenth of the size: a step of heat. Beside
+it (extra `peers`) what robust_laplacian (Sharp and Crane 2020) makes of the same points.
 """
 
 from __future__ import annotations
@@ -16,10 +17,17 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Array, Float
+from scipy.sparse.linalg import spsolve
 from tqdm import tqdm
 
 import jaxsurf as js
+
+try:
+    import robust_laplacian
+except ImportError:
+    robust_laplacian = None
 
 from . import data, surfaces
 from .report import Row, method_name, relative_l2
@@ -76,12 +84,16 @@ def bunny(n: int) -> Case:
     return Case("bunny", cloud, spacing, field, field, None)
 
 
+def moved(case: Case, share: float) -> Float[Array, "n 3"]:
+    """Its points with this share of noise."""
+    shift = np.random.default_rng(0).normal(size=case.cloud.points.shape)
+    return case.cloud.points + share * case.spacing * jnp.asarray(shift)
+
+
 def results(case: Case, reader: Reader, share: float) -> dict[str, Array]:
     """Everything on points with this share of noise."""
     method, k = reader.method, reader.wider * reader.method.neighbor_count(3)
-    clean = case.cloud
-    shift = np.random.default_rng(0).normal(size=clean.points.shape)
-    points = clean.points + share * case.spacing * jnp.asarray(shift)
+    clean, points = case.cloud, moved(case, share)
     normals = js.estimate_normals(points, degree=method.degree, k=k)
     normals = normals * jnp.sign(jnp.sum(normals * clean.normals, axis=1, keepdims=True))
     cloud = js.PointCloud(points, normals, boundary=clean.boundary)
@@ -97,8 +109,33 @@ def results(case: Case, reader: Reader, share: float) -> dict[str, Array]:
     return dict(zip(_QUANTITIES, found))
 
 
-def _made(case: Case, reader: Reader, share: float) -> dict[str, Array] | None:
+class Peer:
+    """robust_laplacian: linear elements on triangles of every neighbourhood."""
+
+    name = "robust_laplacian"
+
+
+def results_of_peer(case: Case, share: float) -> dict[str, Array]:
+    """The same; normals, which it does not make, are those without noise."""
+    points, field = np.asarray(moved(case, share)), np.asarray(case.field)
+    stiffness, mass = robust_laplacian.point_cloud_laplacian(points)
+    per_area = sp.diags_array(1 / mass.diagonal()) @ stiffness
+    normals = case.cloud.normals
+    curvature = jnp.sum(jnp.asarray(per_area @ points) * normals, axis=1) / 2
+    system = sp.csr_array(mass + case.scale * stiffness)
+    border = case.cloud.boundary
+    free = np.ones(len(points), bool) if border is None else ~np.asarray(border)
+    rhs = mass @ np.asarray(case.rhs) - system[:, ~free] @ field[~free]
+    solution = field.copy()
+    solution[free] = spsolve(sp.csc_array(system[free][:, free]), rhs[free])
+    found = (normals, curvature, jnp.asarray(-per_area @ field), jnp.asarray(solution))
+    return dict(zip(_QUANTITIES, found))
+
+
+def _made(case: Case, reader: Reader | Peer, share: float) -> dict[str, Array] | None:
     """The results, or None where the noise leaves a point too few neighbours on its side."""
+    if isinstance(reader, Peer):
+        return results_of_peer(case, share)
     try:
         return results(case, reader, share)
     except ValueError as error:
@@ -146,7 +183,11 @@ def run(quick: bool, out: Path) -> list[Row]:
     seen: dict[tuple[str, str], dict[str, list[float]]] = {}
     for case in cases:
         # Wide lists of a degree that noise needs to be low for: once is enough.
-        readers = _QUICK if quick else _READERS if case.name == "torus" else _READERS[:-1]
+        readers: list[Reader | Peer] = [*(_QUICK if quick else _READERS)]
+        if case.name != "torus":
+            readers = readers[:-1]
+        if robust_laplacian is not None:
+            readers.append(Peer())
         for reader in tqdm(readers, desc=f"noise, {case.name}"):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # it bends within one stencil
@@ -165,7 +206,8 @@ def run(quick: bool, out: Path) -> list[Row]:
                     rows.append(
                         Row(name, value, setting | {"noise": share}, None, "project", bound)
                     )
-                bound = _STEEPER if known and reader.wider == 1 else None
+                usual = isinstance(reader, Reader) and reader.wider == 1
+                bound = _STEEPER if known and usual else None
                 name = f"{name}: growth over proportional"
                 rows.append(Row(name, _added(values), setting, None, "project", bound))
     _picture(out / "noise.png", seen)

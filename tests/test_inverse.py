@@ -56,6 +56,27 @@ def test_a_rate_and_its_deviation(optimizer):
     assert abs(lifetime / (exact / found.theta**2) - 1) < 1e-6
 
 
+def test_what_data_do_not_tell_has_no_posterior():
+    """Neither by steps of first order, which find something, nor where data cease to depend."""
+    three = lambda a: a * jnp.ones(3)
+    ask = functools.partial(js.solve_inverse, noise=0.1)
+    descend = functools.partial(ask, optimizer=optax.lbfgs())
+    for model, unknowns, words in (
+        (lambda a: three(a[0]), 2, "no datum depends on unknown 1"),
+        (lambda a: three(a[0] * a[1]), 2, "data do not tell 2 unknowns"),
+        (lambda a: a[:3], 4, "3 data for 4 unknowns"),
+    ):
+        found = descend(model, jnp.ones(unknowns), three(2.0))
+        assert found.converged
+        with pytest.raises(ValueError, match=f"{words}.* at what was found"):
+            found.posterior()
+    faded = ask(lambda a: a[0] * a[1] ** jnp.arange(3), jnp.ones(2), jnp.zeros(3))
+    with pytest.raises(ValueError, match="no datum depends on unknown 1"):
+        faded.posterior()
+    with pytest.raises(js.OptimizationError, match="vanishes at the first theta"):
+        descend(lambda a: three(a**2), jnp.array(0.0), three(2.0))
+
+
 def test_single_precision():
     times = TIMES.astype(jnp.float32)
     model = lambda rate: jnp.exp(-rate * times)

@@ -82,6 +82,32 @@ def test_least_area_at_fixed_volume_is_a_ball_and_compiles_no_step():
     np.testing.assert_allclose(larger.theta, np.log(1.5) / 3, atol=2e-3)
 
 
+def test_steps_of_a_given_length_meet_constraints():
+    """Without a penalty that grows beyond all bounds, since their violations do not tell of it."""
+    found = axes_found(optax.adam(1e-2), steps=1_000)
+    assert found.converged, found
+    np.testing.assert_allclose(found.theta, 0, atol=5e-3)
+    assert found.history["penalty"][-1] < 1e3 * found.history["penalty"][0]
+    few = axes_found(optax.adam(1e-3), steps=60)
+    off = abs(float(few.equalities["volume"]))
+    assert few.stopped == f"all 60 steps used, and constraints are off by {off:.2g}"
+
+
+def test_what_is_bad_with_other_neighbours_is_no_end():
+    """Sheets that meet are seen with neighbours found anew: nothing has converged there."""
+    flat = js.discretize(js.ellipsoid(500, (1.0, 1.0, 0.4)), method=METHOD)
+    top = flat.cloud.points[:, 2] > 0.3
+    height = lambda surface: jnp.mean(jnp.where(top, surface.cloud.points[:, 2], 0))
+    for optimizer in (LBFGS, optax.sgd(20.0)):
+        with pytest.raises(js.OptimizationError, match="passes through itself") as e:
+            js.optimize_shape(
+                height, js.NormalShape(flat), jnp.zeros(500), optimizer=optimizer, steps=60
+            )
+        found = e.value.solution
+        assert found.history["gradient"][-1] > 0 and not found.converged
+        assert not np.asarray(found.surface.code).any()
+
+
 def test_neighbours_are_those_of_the_surface_that_is_reached():
     """Stretched to twice its length and more, with the lists that `choose_neighbors` finds."""
     target = jnp.array([2.2, 1.0, 0.8])
@@ -228,6 +254,12 @@ def test_numbers_that_are_none():
     found = js.optimize_shape(root, shape, 1.1 * jnp.ones(3), optimizer=optax.sgd(0.3), throw=False)
     assert "not finite" in found.stopped and np.isfinite(found.objective)
     assert 1 <= float(size(found.surface)) < 1.05
+    found = js.optimize_shape(root, shape, 1.1 * jnp.ones(3), optimizer=LBFGS, throw=False)
+    assert "no step along the search" in found.stopped and "is not finite" in found.stopped
+    runaway = js.optimize_shape(
+        lambda surface: -size(surface), shape, jnp.ones(3), optimizer=optax.sgd(1e30), throw=False
+    )
+    assert "the objective went from -1 to" in runaway.stopped
 
 
 def test_steps_to_where_an_integration_diverges_are_halved():

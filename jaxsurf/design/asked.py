@@ -74,9 +74,11 @@ def check_projection(project: Callable | None, optimizer, theta) -> None:
         )
 
 
-def refuse_start(values: Values) -> None:
-    """Say what is not good at the start."""
+def refuse_start(theta, values: Values) -> None:
+    """Say what is not good at the start, which a projection may have moved."""
     code = int(values.code)
+    if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(theta)):
+        raise ValueError(f"project makes {theta} of the first theta, expected finite numbers")
     named = {"objective": values.objective} | values.equalities | values.inequalities
     for name, x in named.items():
         if not np.isfinite(np.asarray(x)).all():

@@ -52,7 +52,8 @@ class LevelSetShape(AbstractShape):
 
     Args:
         phi: function of one point `(d,)` and of parameters, any pytree (an `eqx.nn.MLP`, say,
-            under `eqx.filter_grad` and `eqx.filter_jit`).
+            under `eqx.filter_grad` and `eqx.filter_jit`). Smooth near the level set: where
+            sheets meet in a kink, as by `jnp.minimum` of two, points have no normals.
         surface: of a level set nearby, as of `js.level_set(lambda x: phi(x, theta0), ...)`.
         bounds: lower and upper corner of a box that the level set stays in, as of `js.level_set`;
             None where its topology does not change.

@@ -39,6 +39,8 @@ _INNER, _GOAL = 20, 0.1
 # A violation that does not fall to this share makes the penalty grow by that factor; one that
 # stays above the last share so many times in a row cannot be mended.
 _FALLS, _GROWTH, _STAYS, _STALLS = 0.25, 4.0, 0.9, 8
+# An objective that has grown so much has run away.
+_RUN_AWAY = 1e3
 
 
 class _Run(NamedTuple):
@@ -162,12 +164,15 @@ class Loop(NamedTuple):
         f, h, g = kinds(problem, theta)
         if f.shape != ():
             raise ValueError(f"objective returns shape {f.shape}, expected one number")
+        for name, x in (h | g).items():
+            if not x.size:
+                raise ValueError(f"constraint {name!r} returns shape {x.shape}: no numbers")
         nothing = lambda some: {name: jnp.zeros(x.shape, x.dtype) for name, x in some.items()}
         given = self.numbers["penalty"]
         mu = jnp.asarray(10 if given is None else given, f.dtype)
         multipliers = Multipliers(nothing(h), nothing(g), mu)
         theta, values = evaluated(problem, theta, multipliers)
-        refuse_start(values)
+        refuse_start(theta, values)
         if given is None and (h or g):
             mu = 10 * jnp.maximum(1, jnp.abs(values.objective))
             multipliers = multipliers._replace(penalty=mu)
@@ -193,27 +198,29 @@ class Loop(NamedTuple):
             theta, values = evaluated(problem, theta, run.multipliers, *updates)
             return self.covered(shape, theta, values, run.multipliers, search), theta
 
-        # A search along a line goes on to where there are other parts.
-        beyond = lambda theta: look(theta)[0][1]
+        ills: list[str] = []
+
+        def beyond(theta):
+            """A search along a line goes on to where there are other parts."""
+            (_, values, ill), _ = look(theta)
+            ills.extend(filter(None, [ill]))
+            return values
+
         updates, state = direction(self.optimizer, beyond, run.theta, run.values, run.state)
         for refused in range(_HALVINGS + 1):
             (covering, values, ill), theta = look(run.theta, updates, 0.5**refused)
+            anew = covering
+            if not ill and bool(values.worn) and search is not None:
+                anew, ill = self.renewed(covering, theta, run.multipliers, search)
             if not ill:
                 break
         else:
-            why = f"steps were halved {_HALVINGS} times, and still {ill}"
-            return run, shape, f"{why}: the last good shape is kept"
-        rebuilt, shape = covering is not shape, covering
+            return run, shape, _halved(run, ill)
+        rebuilt, renewed, shape = covering is not shape, anew is not covering, anew
         still, why = _same(run.theta, theta), ""
         run = run._replace(
             step=run.step + 1, theta=theta, state=state, values=values, since=run.since + 1
         )
-        renewed = bool(values.worn) and search is not None
-        if renewed:
-            try:
-                shape = _renewed(shape, theta, search)
-            except ValueError as error:
-                renewed, why = False, f"neighbours could not be found anew: {error}"
         if renewed or rebuilt:
             run = run._replace(lists=eqx.filter(shape, eqx.is_array))
         small = float(values.size) <= float(run.goal) * float(run.first)
@@ -221,11 +228,13 @@ class Loop(NamedTuple):
             still or small or int(run.since) >= _INNER
         )
         if corrected:
-            run = self.corrected(run)
+            run = self.corrected(run, solved=still or small)
         if renewed or rebuilt or corrected:
             run = _seen_again(self.problem(shape), run, self.optimizer)
         elif still:
-            why = why or "no step along the search lowers the objective"
+            why = "no step along the search lowers the objective"
+            if ills:
+                why += f", and farther along it {ills[-1]}: the last good shape is kept"
         if int(run.stalls) >= _STALLS:
             why = (
                 f"constraints are not met: a violation of {float(run.violation):.3g} has stayed "
@@ -246,14 +255,27 @@ class Loop(NamedTuple):
         code = int(values.code)
         return covering, values, ILL[code] if code else ""
 
-    def corrected(self, run: _Run) -> _Run:
-        """With forces that the constraints were met with, and the penalty that this asks for."""
+    def renewed(self, shape, theta, multipliers, search) -> tuple[AbstractShape, str]:
+        """The shape with neighbours found anew at theta, and what is wrong with it."""
+        try:
+            anew = _renewed(shape, theta, search)
+        except ValueError as error:
+            return shape, f"neighbours could not be found anew: {error}"
+        code = int(evaluated(self.problem(anew), theta, multipliers)[1].code)
+        return anew, f"with neighbours found anew {ILL[code]}" if code else ""
+
+    def corrected(self, run: _Run, solved: bool) -> _Run:
+        """With forces that the constraints were met with, and the penalty that this asks for.
+
+        A violation tells of penalty and constraints only where the Lagrangian was minimised: steps
+        of a given length leave one that no penalty takes away.
+        """
         now, last = float(run.values.violation), float(run.violation)
         multipliers = run.values.forced
         wrong = now > self.numbers["ctol"]
-        if wrong and now > _FALLS * last:
+        if wrong and solved and now > _FALLS * last:
             multipliers = multipliers._replace(penalty=_GROWTH * multipliers.penalty)
-        stalls = run.stalls + 1 if wrong and now > _STAYS * last else np.array(0)
+        stalls = run.stalls + solved if wrong and now > _STAYS * last else np.array(0)
         goal = np.maximum(self.numbers["rtol"], _GOAL * run.goal)
         return run._replace(
             multipliers=multipliers, violation=np.array(now), stalls=stalls, goal=goal,
@@ -265,8 +287,11 @@ class Loop(NamedTuple):
         small = float(run.values.size) <= self.numbers["rtol"] * float(run.first)
         if small and float(run.values.violation) <= self.numbers["ctol"]:
             return "converged"
-        steps = self.numbers["steps"]
-        return f"all {steps} steps used" if int(run.step) >= steps else ""
+        steps, off = self.numbers["steps"], float(run.values.violation)
+        if int(run.step) < steps:
+            return ""
+        unmet = f", and constraints are off by {off:.2g}" if off > self.numbers["ctol"] else ""
+        return f"all {steps} steps used{unmet}"
 
     def found(self, run: _Run, shape, stopped: str) -> ShapeOptimization:
         rows = {name: values[: int(run.step) + 1].copy() for name, values in run.history.items()}
@@ -275,6 +300,15 @@ class Loop(NamedTuple):
             run.theta, shape, v.objective, v.equalities, v.inequalities, forces, rows,
             stopped == "converged", stopped or "under way",
         )  # fmt: skip
+
+
+def _halved(run: _Run, ill: str) -> str:
+    """Why there is no step."""
+    why = f"steps were halved {_HALVINGS} times, and still {ill}"
+    first, now = float(run.history["objective"][0]), float(run.values.objective)
+    if abs(now) > _RUN_AWAY * max(abs(first), 1):
+        why += f"; before that the objective went from {first:.3g} to {now:.3g}: shorter steps?"
+    return f"{why}: the last good shape is kept"
 
 
 def _is_only_far(surface: Discretization) -> bool:

@@ -40,12 +40,12 @@ def optimize_shape(
 
     Constraints are met by an augmented Lagrangian: multipliers that are corrected whenever its
     gradient has fallen tenfold, or every 20 steps, and a penalty that grows fourfold where that
-    does not serve. Steps after which the surface folds or passes through itself, or a number is
-    not finite, are halved. Neighbours are found anew once the surface was sheared or stretched by
-    about an eighth (`AbstractShape.renewed`), points are chosen anew where a level set in `bounds`
-    has other parts (`js.LevelSetShape`); the optimiser keeps its state, and nothing is compiled
-    again. Only L-BFGS begins again where the points that are chosen cannot follow back to the step
-    before.
+    gradient has fallen and the violation has not. Steps after which the surface folds or, without
+    a border, passes through itself, or a number is not finite, are halved. Neighbours are found
+    anew once the surface was sheared or stretched by about an eighth (`AbstractShape.renewed`),
+    points are chosen anew where a level set in `bounds` has other parts (`js.LevelSetShape`); the
+    optimiser keeps its state, and nothing is compiled again. Only L-BFGS begins again where the
+    points that are chosen cannot follow back to the step before.
 
     Args:
         objective: $f(S)$, of a `Discretization` and `args`; returns a number.
@@ -76,8 +76,9 @@ def optimize_shape(
         throw: raise where it cannot go on; if False, see `stopped`.
 
     Returns:
-        `ShapeOptimization`: `theta`, `surface`, `objective`, `multipliers`, `history`. Steps that
-        are used up are no error.
+        `ShapeOptimization`: `theta`, `surface`, `objective`, `multipliers`, `history`, of the last
+        step, which with methods of first order need not be the lowest. Steps that are used up are
+        no error; `stopped` says by how much constraints are off then.
 
     Accuracy: of the functions; gradients are exact for fixed neighbours. In float32 the radius of
         a ball is found within 1e-3 (`tests/test_optimize.py::test_single_precision`).

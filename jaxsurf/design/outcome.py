@@ -18,7 +18,7 @@ COLUMNS = (
 
 
 class ShapeOptimization(eqx.Module):
-    """The best shape that was found, and the way there: made by `optimize_shape`.
+    """The last good shape, and the way there: made by `optimize_shape`.
 
     Args:
         theta: its parameters.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,10 +13,11 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ..arguments import as_float, floating, further, instance, real, traced_call, whole
+from ..arguments import as_float, floating, further, instance, real, whole
 from ..design.lagrangian import started, strong
 from ..design.outcome import OptimizationError
-from ..failures import needs_values, raise_at
+from ..failures import needs_values
+from .asked import in_sight, priors, refuse, with_noise
 from .posterior import Posterior, posterior_of
 from .priors import AbstractPrior
 from .problem import (
@@ -26,11 +26,7 @@ from .problem import (
     along,
     conjugate,
     descent,
-    each,
-    free_columns,
-    is_prior,
     newton,
-    pairs,
     seen,
     size_of,
     slope,
@@ -51,10 +47,10 @@ _PAST = 0.75
 _SHARE = 0.1
 # No step may be longer in any part of the white noise: what is likely before the data lies within.
 _LONGEST = 3.0
+# Data that are missed by so much, in deviations squared, are not where to stay without a step.
+_MISSED = 4.0
 # The first step of Gauss and Newton is solved for to this share, later ones better.
 _FORCING = 0.5
-# Unknowns are not told apart where data change by less than this many roots of the last digit.
-_SINGULAR = 10.0
 _COLUMNS = ("energy", "misfit", "gradient", "decrement", "linear_steps", "shortened", "seconds")
 
 
@@ -99,12 +95,8 @@ class Inversion(eqx.Module):
         Raises:
             ValueError: unknowns without a prior that the data do not tell apart there.
         """
-        found = posterior_of(self.problem, self.xi, self.theta)
-        if not np.isfinite(found.rest).all():
-            raise ValueError(
-                "data do not tell the unknowns without a prior apart at what was found"
-            )
-        return found
+        scaled = bool(self.history["linear_steps"].any())
+        return posterior_of(self.problem, self.xi, self.theta, scaled)
 
     def __repr__(self):
         rows = self.history
@@ -169,8 +161,9 @@ def solve_inverse(
             are asked for (`js.integrate` has both modes if it is not given an `adjoint`).
         ValueError: data, noise or priors of other shapes than the model's; noise that is not
             positive; data or predictions that are not finite (named by number); unknowns without
-            a prior on which the data do not depend, or that they do not tell apart: the system of
-            Gauss and Newton is singular; traced arrays.
+            a prior on which the data do not depend at the first theta, or that they do not tell
+            apart there: the system of Gauss and Newton is singular (steps of first order have
+            none); traced arrays.
         OptimizationError: no step lowers J; its `solution` has the best unknowns so far.
 
     Example:
@@ -193,13 +186,13 @@ def solve_inverse(
     linear_steps = whole(linear_steps, "linear_steps", least=1)
     needs_values("theta, data, noise, prior and args", theta, data, noise, prior, args)
     theta, args = strong(floating(theta, "theta")), further(args)
-    prior = _priors(prior, theta)
+    prior = priors(prior, theta)
     for name, given in (("data", data), ("noise", noise)):
         if not jax.tree.leaves(given):
             raise TypeError(f"{name} is {given!r}, expected numbers")
     data = jax.tree.map(lambda d: as_float(d, "data"), data)
     problem = Problem(forward, args, data, noise, prior, jax.tree.map(jnp.ones_like, theta))
-    problem = _with_noise(problem, theta)
+    problem = with_noise(problem, theta)
     dtype = jnp.result_type(*jax.tree.leaves(theta))
     tol = (1e-3 if jnp.finfo(dtype).bits > 32 else 0.05) if tol is None else tol
     tol = real(tol, "tol", above=0)
@@ -214,7 +207,11 @@ def _run(problem, theta, optimizer, steps, linear_steps, tol) -> tuple[Inversion
     clock = time.perf_counter()
     rows: dict[str, list] = {name: [] for name in _COLUMNS}
     look = seen if optimizer is None else slope
-    problem, xi, now = _start(problem, theta, look)
+    xi = strong(problem.whitened(theta))
+    now = look(problem, xi)
+    refuse(problem, theta, now)
+    if optimizer is None:
+        problem, xi = in_sight(problem, theta)
     if optimizer is not None:
         state = started(optimizer, xi)
     first, forcing, stopped, failed = 0.0, _FORCING, "", False
@@ -243,7 +240,10 @@ def _run(problem, theta, optimizer, steps, linear_steps, tol) -> tuple[Inversion
         first = first or float(size)
         forcing = min(_FORCING, max(float(size) / max(first, 1e-300), 1e-12) ** 0.5)
         note(size, decrement, linear, shortened)
-        if float(decrement) <= tol:
+        if float(size) == 0 and len(rows["energy"]) == 1 and rows["misfit"][0] > _MISSED:
+            stopped = "the derivative of J vanishes at the first theta, where data are missed"
+            failed = True
+        elif float(decrement) <= tol:
             stopped = "converged"
         elif not np.isfinite(float(decrement)):
             stopped, failed = "the derivative of the model is not finite", True
@@ -303,109 +303,3 @@ def _found(problem: Problem, xi, now: Seen, rows, stopped: str) -> Inversion:
         problem.theta(xi), predictions, now.energy, jnp.mean(now.residual**2), history,
         stopped == "converged", stopped, problem, xi,
     )  # fmt: skip
-
-
-# --- what is asked ---------------------------------------------------------------------------
-
-
-def _structure(tree: PyTree) -> Any:
-    return jax.tree.structure(tree, is_leaf=is_prior)
-
-
-def _priors(prior, theta) -> PyTree:
-    """One prior or None for each array of the unknowns."""
-    for given in jax.tree.leaves(prior, is_leaf=is_prior):
-        if not is_prior(given):
-            instance(given, AbstractPrior, "prior", "js.GaussianPrior(deviation=1.0), say")
-    if prior is None:
-        return jax.tree.map(lambda _: None, theta)
-    have, want = _structure(prior), _structure(theta)
-    if have != want:
-        raise ValueError(
-            f"prior has the structure {have}, theta {want}: one prior or None for each array"
-        )
-    for given, x in pairs(prior, theta):
-        if given is None:
-            continue
-        try:
-            shape = jax.eval_shape(given.whiten, x).shape
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"prior of unknowns of shape {x.shape}: {error}") from error
-        if shape != x.shape:
-            raise ValueError(f"prior of unknowns of shape {x.shape}: it is of shape {shape}")
-    return prior
-
-
-def _with_noise(problem: Problem, theta) -> Problem:
-    """With standard deviations for all data, which the model has to predict."""
-    predicted = eqx.filter_eval_shape(traced_call, problem.forward, "forward", theta, *problem.args)
-    if not jax.tree.leaves(predicted):
-        raise TypeError(f"forward returns {predicted!r}, expected arrays like the data")
-    have, want = _structure(problem.data), _structure(predicted)
-    if have != want:
-        raise ValueError(f"data have the structure {have}, forward returns {want}")
-    for d, f in zip(jax.tree.leaves(problem.data), jax.tree.leaves(predicted)):
-        if not jnp.issubdtype(getattr(f, "dtype", object), jnp.floating):
-            kind = getattr(f, "dtype", type(f).__name__)
-            raise TypeError(f"forward returns {kind}, expected floating-point numbers")
-        if d.shape != f.shape:
-            raise ValueError(f"data have shape {d.shape}, forward returns {f.shape}")
-        raise_at(~np.isfinite(d).ravel(), "datum {i} is {v}, expected a number", np.ravel(d))
-    like = lambda s: jax.tree.map(lambda _: s, problem.data)
-    noise = problem.noise
-    if _structure(noise) != have:
-        if _structure(noise) != _structure(0):
-            raise ValueError(
-                f"noise has the structure {_structure(noise)}, expected a number or {have}"
-            )
-        noise = like(noise)
-
-    def spread(s, d):
-        s = as_float(s, "noise")
-        if s.shape not in ((), d.shape):
-            raise ValueError(f"noise has shape {s.shape}, expected one number or {d.shape}")
-        bad = ~(np.isfinite(s) & (np.asarray(s) > 0)).ravel()
-        raise_at(bad, "noise of datum {i} is {v:g}, expected a positive number", np.ravel(s))
-        return jnp.broadcast_to(s, d.shape).astype(d.dtype)
-
-    noise = jax.tree.map(spread, noise, problem.data)
-    return eqx.tree_at(lambda p: p.noise, problem, noise)
-
-
-def _start(problem: Problem, theta, look) -> tuple[Problem, PyTree, Seen]:
-    """White noise and what is seen there; unknowns without a prior in units that data can see."""
-    xi = strong(problem.whitened(theta))
-    now = look(problem, xi)
-    _refuse(problem, theta, now)
-    free = [x for prior, x in pairs(problem.prior, theta) if prior is None]
-    if not free or look is slope:
-        return problem, xi, now
-    m, z = now.residual.size, sum(x.size for x in free)
-    text = (
-        "the system of Gauss and Newton is singular; give them a prior, js.GaussianPrior(1.0), say"
-    )
-    if m < z:
-        raise ValueError(f"{m} data for {z} unknowns without a prior: {text}")
-    columns = np.asarray(free_columns(problem, xi))
-    sizes = np.linalg.norm(columns, axis=0)
-    raise_at(sizes == 0, f"no datum depends on unknown {{i}} of those without a prior: {text}")
-    least = np.linalg.svd(columns / sizes, compute_uv=False)[-1]
-    if not least > _SINGULAR * np.finfo(columns.dtype).eps ** 0.5:
-        raise ValueError(
-            f"data do not tell {z} unknowns without a prior apart: of changes of size one, in "
-            f"units that data can see, one changes them by {least:.1g} only: {text}"
-        )
-    units = iter(ravel_pytree(free)[1](jnp.asarray(1 / sizes, columns.dtype)))
-    unit = each(lambda prior, x: next(units) if prior is None else x, problem.prior, problem.unit)
-    problem = eqx.tree_at(lambda p: p.unit, problem, unit)
-    return problem, strong(problem.whitened(theta)), now
-
-
-def _refuse(problem: Problem, theta, now: Seen) -> None:
-    """Say what is not good at the start."""
-    if np.isfinite(now.energy):
-        return
-    problem.forward(theta, *problem.args)  # may say why
-    text = "the prediction of datum {i} is not finite at the first theta"
-    raise_at(~np.isfinite(now.residual), text)
-    raise ValueError("J is not finite at the first theta")

@@ -13,12 +13,14 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, PyTree
 
 from ..arguments import traced_call, whole
 from ..compiling import sized_jit
+from .asked import told_apart
 from .problem import Problem, each, jacobian
 
 
@@ -90,11 +92,13 @@ class Posterior(eqx.Module):
         return _samples(self, key, whole(count, "count", least=1))
 
 
-def posterior_of(problem: Problem, xi: PyTree, mean: PyTree) -> Posterior:
+def posterior_of(problem: Problem, xi: PyTree, mean: PyTree, scaled: bool) -> Posterior:
+    """That of unknowns found, in units that data could see at the start or not."""
     flat, unravel = ravel_pytree(xi)
     known = ravel_pytree(problem.known(unravel(jnp.ones_like(flat))))[0]
     m = sum(x.size for x in jax.tree.leaves(problem.data))
     slopes = jacobian(problem, xi, rows=m <= flat.size)
+    told_apart(np.asarray(slopes)[:, np.asarray(known) == 0], "what was found", scaled=scaled)
     factor, rest = _factors(slopes, known, int(jnp.sum(known == 0)))
     return Posterior(mean, problem, xi, known, factor, rest)
 

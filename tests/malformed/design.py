@@ -73,6 +73,8 @@ CALLS = [
     ("optimize_shape", "a constraint without a name", optimized(equalities=[reach]), ("equalities", "Mapping", "volume")),
     ("optimize_shape", "a number for a constraint", optimized(inequalities={"a": 1.0}), ("inequalities['a'] is a float", "function")),
     ("optimize_shape", "a constraint that is no number", optimized(equalities={"a": lambda s: reach(s) / 0}), ("constraint 'a' is inf", "first theta")),
+    ("optimize_shape", "a constraint without numbers", optimized(equalities={"a": lambda s: s.areas[:0]}), ("constraint 'a'", "(0,)", "no numbers")),
+    ("optimize_shape", "a projection to no numbers", optimized(project=lambda t: t * jnp.nan), ("project makes", "nan", "finite")),
     ("optimize_shape", "one name twice", optimized(equalities={"a": reach}, inequalities={"a": reach}), ("'a'", "taken")),
     ("optimize_shape", "no steps", optimized(steps=0), ("steps = 0", "at least 1")),
     ("optimize_shape", "a penalty below zero", optimized(penalty=-1.0), ("penalty = -1", "above 0")),

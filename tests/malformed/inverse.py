@@ -60,6 +60,7 @@ CALLS = [
     ("solve_inverse", "a prediction that is no number", inverted(lambda a: line(a).at[2].set(jnp.log(-a))), ("prediction of datum 2", "not finite")),
     ("solve_inverse", "more unknowns than data", inverted(lambda a: a[:3], jnp.ones(4)), ("3 data for 4 unknowns", "singular", "prior")),
     ("solve_inverse", "an unknown without effect", inverted(lambda a: line(a[0]), jnp.ones(2)), ("unknown 1", "singular", "prior")),
+    ("solve_inverse", "a slope without end", inverted(lambda a: jnp.sqrt(a) * jnp.ones(3), jnp.array(0.0)), ("derivative of the data in unknown 0", "inf", "first theta")),
     ("solve_inverse", "unknowns in one product", inverted(lambda a: line(a[0] * a[1]), jnp.ones(2)), ("apart", "singular", "prior")),
     ("solve_inverse", "an optimiser's name", inverted(optimizer="adam"), ("optimizer is 'adam'", "optax.lbfgs()")),
     ("solve_inverse", "no steps", inverted(steps=0), ("steps = 0", "at least 1")),

@@ -1,5 +1,6 @@
 """The command line of the experiments, and that a bound that is not kept is seen."""
 
+import importlib
 import inspect
 import json
 import math
@@ -7,18 +8,39 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import jaxsurf as js
 from experiments import __main__ as command
 from experiments import e01_circle_laplacian as e01
 from experiments import e06_ellipsoid_curvature as e06
 from experiments import surfaces
-from experiments.benchmarks import prompt
+from experiments.benchmarks import prompt, shapes
 from experiments.report import Row, slope, table
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+# All but the neural one, which fits a network first; its steps are Newton's, and converge.
+OBJECTIVES = [name for name in shapes.SIZES if name != "neural-bunny"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_derivatives_of_objectives(name):
+    """What an experiment minimises, less its line of first order, is of second order."""
+    module = importlib.import_module(f"experiments.{command.EXPERIMENTS[name][0]}")
+    f, theta = module.problem(shapes.SIZES[name][1])
+    flat, unravel = ravel_pytree(theta)
+    noise = np.random.default_rng(0).normal(size=flat.shape)
+    direction = unravel(jnp.asarray(noise * np.linalg.norm(flat) / np.linalg.norm(noise)))
+    steps = jnp.array([1e-3, 5e-4, 2.5e-4])
+    found = js.taylor_remainders(jax.jit(f), theta, direction, steps=steps)
+    assert abs(found.slope - 2) < 0.05, found
 
 
 def test_list_names_every_experiment(capsys):

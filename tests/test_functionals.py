@@ -92,6 +92,32 @@ def test_derivatives_in_the_geometry():
     assert abs(found.slope - 2) < 0.02, found
 
 
+def test_derivatives_of_what_the_surface_does():
+    """Of curvatures, eigenvalues, heat, repulsion and thickness: nothing of first order is left."""
+    start = jnp.exp(ball().cloud.points[:, 0])
+
+    def heat(surface):
+        problem = js.AdvectionDiffusionReaction(surface.laplacian)
+        u = js.integrate(problem, start, t1=0.1, rtol=1e-9, atol=1e-12).ys[-1]
+        return surface.inner(surface.cloud.points[:, 2] ** 2, u)
+
+    functionals = {
+        "area": lambda s: s.areas.sum(),
+        "mean curvature": lambda s: s.integrate(s.mean_curvature),
+        "bending": lambda s: s.integrate(s.mean_curvature**2),
+        "eigenvalues": lambda s: jnp.sum(js.eigenmodes(s.laplacian, 4).values),
+        "heat content": heat,
+        "repulsion": js.tangent_point_energy,
+        "thickness": lambda s: jnp.sum(js.medial_radius(s)),
+    }
+    axes, direction = jnp.array([1.0, 0.9, 0.8]), jnp.array([0.3, -0.2, 0.4])
+    steps = jnp.array([1e-3, 5e-4, 2.5e-4])
+    for name, f in functionals.items():
+        compiled = jax.jit(lambda axes, f=f: f(stretched(axes)))
+        found = js.taylor_remainders(compiled, axes, direction, steps=steps)
+        assert abs(found.slope - 2) < 0.02, (name, found)
+
+
 def test_compliance_of_the_ball():
     r"""$4\pi a^2 / 3 / (2 / a^2 + \kappa)$ for the load z / a on a sphere of radius a."""
     z = ball().cloud.points[:, 2]

@@ -62,9 +62,8 @@ def measured(name: str, n: int) -> dict:
     found = {"unknowns": sum(np.size(leaf) for leaf in jax.tree.leaves(theta))}
     programs = {}
     for key, function in (("value", f), ("gradient", jax.value_and_grad(f))):
-        lowered = jax.jit(function).lower(theta)
         start = time.perf_counter()
-        programs[key] = program = lowered.compile()
+        programs[key] = program = jax.jit(function).lower(theta).compile()
         found[f"{key} compiled s"] = time.perf_counter() - start
         found[f"{key} temporary GiB"] = program.memory_analysis().temp_size_in_bytes / 2**30
     value, gradient = ((lambda program=program: program(theta)) for program in programs.values())

@@ -26,7 +26,8 @@ class AbstractShape(eqx.Module):
     r"""A family of surfaces: `shape(theta)` is the discretisation that belongs to $\theta$.
 
     Its points are those of a reference moved along, its neighbours those of the reference: all
-    arrays keep their shapes, and nothing jumps. A shape of one's own moves a surface likewise.
+    arrays keep their shapes, and nothing jumps (but integrals, by some 1e-9 of them, where the cell
+    of a point gets another side). A shape of one's own moves a surface likewise.
 
     Example:
         >>> class Scaled(js.AbstractShape):

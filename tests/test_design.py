@@ -90,6 +90,42 @@ def test_derivatives_are_differences_of_shapes_made_anew(name):
     np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.parametrize("method", [js.GFDM(degree=2), js.DCPSE(order=2)], ids=["GFDM", "DCPSE"])
+def test_derivatives_of_every_operator_on_a_level_set(method):
+    """Against differences of the same on points that are projected again, to 1e-6."""
+    x = ball().cloud.points
+    u, w = jnp.exp(x[:, 0] + 0.5 * x[:, 1]), jnp.cos(x[:, 1] + 2 * x[:, 2]) + x[:, 0]
+    tangent = jnp.cross(jnp.array([0.3, -1.0, 0.5]), x)
+    seen = {
+        "Laplacian": lambda s: s.laplacian(u),
+        "gradient": lambda s: s.gradient(u) @ jnp.array([1.0, 0.5, -0.3]),
+        "divergence": lambda s: s.divergence(tangent),
+        "direction": lambda s: s.directional_derivative(tangent)(u),
+        "diffusion": lambda s: s.diffusion(1 + u**2)(w),
+        "biharmonic": lambda s: s.biharmonic(u) / 100,
+        "symmetric Laplacian": lambda s: s.symmetric_laplacian(u),
+        "mean curvature": lambda s: s.mean_curvature,
+        "Gauss curvature": lambda s: s.gauss_curvature,
+        "principal curvatures": lambda s: jnp.sum(s.principal_curvatures[0] ** 3, axis=1),
+        "areas": lambda s: N * s.areas,
+        "cells": lambda s: N * s.cell_areas,
+        "interpolation": lambda s: s.interpolate(u, s.cloud.points + 0.01 * tangent),
+    }
+    surface = js.discretize(js.sphere(N), method=method)
+    shape, theta = js.LevelSetShape(egg, surface), jnp.array([1.0, 0.95, 0.9])
+    direction = random(theta, 0.1)
+
+    def along(t):
+        moved = shape(theta + t * direction)
+        return jnp.stack([jnp.vdot(w, f(moved)) / N for f in seen.values()])
+
+    found = jax.jit(lambda: jax.jvp(along, (0.0,), (1.0,))[1])()
+    wanted = central_difference(jax.jit(along), 0.0, 1.0, step=1e-3)
+    off = np.abs(np.asarray(found - wanted))
+    good = off <= 1e-6 * np.abs(np.asarray(wanted)) + 1e-7
+    assert good.all(), dict(zip(seen, off))
+
+
 def test_points_and_normals_are_those_of_the_shape():
     shape, theta, _ = cases()["level set"]
     cloud = shape(theta).cloud

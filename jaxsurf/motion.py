@@ -18,7 +18,7 @@ from .frames import frames_of
 # What a code says of a point.
 CODES = {
     1: "its position or normal is not finite",
-    2: "the normal of a neighbour next to it points to the other side: the surface folds or meets itself",
+    2: "the normal of a neighbour next to it points to the other side: a fold, or another sheet",
     3: "its stencil is degenerate",
     4: "its list of neighbours no longer reaches",
     5: "more neighbours than there is room for",

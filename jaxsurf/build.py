@@ -26,7 +26,14 @@ from .failures import (
 from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .indices import mask as checked_mask
 from .machine import TRIED, block
-from .neighbors import Neighbors, Rows, find_neighbors, nearest_of, switched_on
+from .neighbors import (
+    Neighbors,
+    Rows,
+    find_neighbors,
+    nearest_of,
+    switched_on,
+    with_near,
+)
 from .stencils.gathers import take
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood, weights_by
 from .stencils.stencil import Stencil
@@ -79,8 +86,13 @@ def choose_neighbors(
     else:
         needed = ~np.asarray(checked_mask(bound, cloud.n, "bound"))
     neighbors = _adapted(cloud, method, throw, needed)[0]
-    mask = np.asarray(neighbors.mask) & needed[:, None]
-    return Neighbors(neighbors.indices, on_device(mask), neighbors.radius)
+
+    def held(lists: Neighbors) -> Neighbors:
+        mask = np.asarray(lists.mask) & needed[:, None]
+        return Neighbors(lists.indices, on_device(mask), lists.radius)
+
+    near = neighbors.near
+    return with_near(held(neighbors), None if near is None else held(near))
 
 
 def choose_fewer_neighbors(cloud: PointCloud, method: AbstractMethod) -> Neighbors:
@@ -229,7 +241,8 @@ def _chosen(cloud, method, throw, needed, fewest):
 
     olds = lists[0].T, lists[1].T, *jax.tree.leaves(found)
     indices, mask, *leaves = map(put, olds, kept)
-    new = Neighbors(on_device(indices.T), on_device(mask.T))
+    spread = neighbors if (chosen > k).any() else None
+    new = Neighbors(on_device(indices.T), on_device(mask.T), near=spread)
     return new, jax.tree.unflatten(jax.tree.structure(found), map(on_device, leaves))
 
 

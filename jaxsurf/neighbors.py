@@ -38,6 +38,9 @@ class Neighbors(eqx.Module):
         mask: `(n, k)`, True where a slot holds a neighbour.
         radius: the search radius, scalar or `(n,)`, for lists made with a radius: operators
             then let their kernels vanish smoothly there. None for the k nearest.
+        near: lists of the nearest, where `indices` leaves some of these out, as
+            `choose_neighbors` does where points are uneven: cells of integrals are bounded by the
+            nearest. None where it leaves out none.
 
     Raises:
         TypeError: indices that are not integers, a mask that is not bool.
@@ -54,6 +57,7 @@ class Neighbors(eqx.Module):
     indices: Int[Array, "n k"]
     mask: Bool[Array, "n k"]
     radius: Float[Array, "*n"] | None = None
+    near: Neighbors | None = None
 
     def __check_init__(self):
         if not (is_array(self.indices) and is_array(self.mask)):
@@ -103,6 +107,11 @@ class Neighbors(eqx.Module):
     @property
     def k(self) -> int:
         return self.indices.shape[1]
+
+    @property
+    def nearest(self) -> Neighbors:
+        """Lists that leave out none that is nearer than another."""
+        return self if self.near is None else self.near
 
 
 class Rows(eqx.Module):
@@ -280,7 +289,13 @@ def switched_on(cloud: PointCloud, neighbors: Neighbors) -> Neighbors:
     if cloud.active is None or neighbors.n != cloud.n:
         return neighbors
     mask = _used(cloud.active, neighbors.indices, neighbors.mask)
-    return unchecked(Neighbors, neighbors.indices, mask, neighbors.radius)
+    near = None if neighbors.near is None else switched_on(cloud, neighbors.near)
+    return unchecked(Neighbors, neighbors.indices, mask, neighbors.radius, near)
+
+
+def with_near(lists: Neighbors, near: Neighbors | None) -> Neighbors:
+    """Lists that know the nearest, which they may leave out."""
+    return unchecked(Neighbors, lists.indices, lists.mask, lists.radius, near)
 
 
 @jax.jit

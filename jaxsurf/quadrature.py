@@ -55,11 +55,14 @@ def areas(
     outward: Float[Array, "n d"] | None,
 ) -> Float[Array, " n"]:
     """Weights of the points in integrals over the surface; arguments as of `cell_weights`."""
+    uneven, neighbors = neighbors.near is not None, neighbors.nearest
     look = lambda cells: cell_weights(cloud, neighbors, degree, cells, outward)
-    weights, closed, residual = _by_enough(look, neighbors.k)
+    weights, closed, residual = _by_enough(look, neighbors.k, uneven)
+    more = 2 * neighbors.k
     text = (
         "the neighbours of point {i} do not close its cell, out of {v} of them: mark the "
-        "border of the surface (`boundary`), or choose more neighbours"
+        "border of the surface (`boundary`), or, where there is none, take more neighbours, "
+        f"js.discretize(cloud, js.find_neighbors(cloud, k={more}))"
     )
     bad, count = _open(closed, neighbors.mask)
     weights = refuse(weights, bad, text, count)
@@ -76,8 +79,9 @@ def cell_areas(
 
     Where neighbours do not close a cell, as at folds of a scan, the mean of theirs, with a warning.
     """
+    uneven, neighbors = neighbors.near is not None, neighbors.nearest
     look = lambda cells: _cell_sizes(cloud, neighbors, degree, cells, outward)
-    sizes, closed = _by_enough(look, neighbors.k)
+    sizes, closed = _by_enough(look, neighbors.k, uneven)
     if is_concrete(closed) and not np.all(closed):
         warn(
             f"the cells of {int((~closed).sum())} points, the first {int(jnp.argmin(closed))}, "
@@ -101,11 +105,15 @@ def _completed(sizes, closed, neighbors):
     return sizes, on & ~(sizes > 0)
 
 
-def _by_enough(look: Callable, k: int):
-    """What the usual number of sides gives; where that closes not all cells, all neighbours."""
+def _by_enough(look: Callable, k: int, uneven: bool):
+    """What the usual number of sides gives; where that closes not all cells, all neighbours.
+
+    Traced, uneven points are taken to need all.
+    """
     found = look(_CELLS)
     closed = found[1]
-    return look(k) if is_concrete(closed) and not np.all(closed) else found
+    more = not np.all(closed) if is_concrete(closed) else uneven
+    return look(k) if more else found
 
 
 @copying_jit

@@ -27,7 +27,7 @@ from .compiling import sized_jit
 from .failures import unchecked
 from .machine import COUNTED, SHEETS, TRIED, block
 from .nearest import Grid, Nearest, nearest_in
-from .neighbors import Neighbors, Rows
+from .neighbors import Neighbors, Rows, with_near
 from .sheets import cosine_slack
 from .stencils.method import AbstractMethod
 from .stencils.targets import Laplacian
@@ -146,13 +146,15 @@ def renewed(
     fixed = jax.tree.map(jax.lax.stop_gradient, cloud)
     usual, code, (grid, rings) = usual_lists(search, fixed, before)
     built = operators(cloud, usual, search.method)
+    # Where the lists before had none, those of all points are even, or nearly.
+    near = None if before.near is None else usual
     if not search.sizes:
-        return usual, code, built
+        return with_near(usual, near), code, built
     lists = _Lists(usual.indices.T, usual.mask.T, code)
     lists, changed = _adapted(search, grid, rings, fixed, lists, built[0])
     adapted = _padded(lists, before, search.slots)
     again = lambda: operators(cloud, adapted, search.method)
-    return adapted, lists.code, jax.lax.cond(changed, again, lambda: built)
+    return with_near(adapted, near), lists.code, jax.lax.cond(changed, again, lambda: built)
 
 
 def usual_lists(search: NeighborSearch, cloud: PointCloud, before: Neighbors):

@@ -15,7 +15,7 @@ from ..borders.order import find_border
 from ..cloud import PointCloud
 from ..compiling import on_device
 from ..discretization import Discretization
-from ..neighbors import Neighbors, find_neighbors
+from ..neighbors import Neighbors, find_neighbors, with_near
 
 # By how much the arrays grow when they are full, at least: all that has been compiled is lost.
 _GROWTH = 1.5
@@ -84,7 +84,8 @@ def compact(surface: Discretization, fields: PyTree[Array]) -> tuple[Discretizat
         renamed = lambda names: on_device(row[np.asarray(names)])
         border = Border(renamed(border.points), renamed(border.rows), border.mask)
     cloud = PointCloud(kept(cloud.points), kept(cloud.normals), boundary=marked)
-    lists = Neighbors(on_device(row[np.asarray(lists.indices)[on]]), kept(lists.mask))
+    left = lambda some: Neighbors(on_device(row[np.asarray(some.indices)[on]]), kept(some.mask))
+    lists = with_near(left(lists), None if lists.near is None else left(lists.near))
     fields = jax.tree.map(kept, fields)
     return Discretization(cloud, lists, surface.method, border), fields
 

@@ -99,6 +99,22 @@ def test_conditions_are_met_and_equations_hold_elsewhere(sphere):
     np.testing.assert_allclose(again.value, found.value, atol=1e-9)
 
 
+def test_each_right_hand_side_has_its_own_values_of_conditions(sphere):
+    cloud, laplacian, _ = sphere
+    f, rows = cloud.points[:, :2], np.arange(20)
+    values = jnp.stack([1 + cloud.points[:20, 2], jnp.full(20, -2.0)], axis=1)
+    closed = lambda v: js.eliminate(cloud, js.dirichlet(rows, v))
+    together = js.solve(laplacian - 1, f, closure=closed(values))
+    for i in range(2):
+        one = js.solve(laplacian - 1, f[:, i], closure=closed(values[:, i]))
+        np.testing.assert_allclose(together.value[:, i], one.value, atol=1e-8)
+    same = js.solve(laplacian - 1, f, closure=closed(values[:, 0]))
+    np.testing.assert_allclose(same.value[:, 0], together.value[:, 0], atol=1e-8)
+    for rhs in (f[:, 0], jnp.zeros((cloud.n, 3))):
+        with pytest.raises(ValueError, match=r"values for 2 components, the right-hand side has"):
+            js.solve(laplacian - 1, rhs, closure=closed(values))
+
+
 def test_several_right_hand_sides_and_transformations(sphere):
     cloud, laplacian, preconditioner = sphere
     f = jnp.stack([cloud.points[:, 2], cloud.points[:, 0] * cloud.points[:, 1]], axis=1)

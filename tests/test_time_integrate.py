@@ -2,6 +2,7 @@
 
 import logging
 import re
+import warnings
 
 import diffrax as dfx
 import equinox as eqx
@@ -235,6 +236,18 @@ def test_advection_without_damping_warns():
     with pytest.warns(UserWarning, match="upwind_viscosity"):
         solution = js.integrate(problem, jnp.sin(ANGLES), t1=0.1)
     assert "hyperviscosity" in solution.stats["solver"]
+
+
+def test_a_state_below_the_tolerance_is_told():
+    """Errors of `atol` are allowed: of fields smaller than that nothing may be left."""
+    operator = js.laplace_beltrami(js.sphere(200), method=js.GFDM(degree=2))
+    problem, z = js.AdvectionDiffusionReaction(operator), js.sphere(200).points[:, 2]
+    with pytest.warns(UserWarning, match=r"u0 is at most 1e-09 in size and errors of atol = 1e-06"):
+        js.integrate(problem, 1e-9 * z, t1=0.1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        js.integrate(problem, 1e-9 * z, t1=0.1, atol=1e-15)
+        js.integrate(problem, 0 * z, t1=0.1)
 
 
 def test_very_many_steps_are_told():

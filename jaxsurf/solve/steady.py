@@ -60,7 +60,8 @@ def solve(
     Args:
         operator: A, a scalar stencil such as `js.laplace_beltrami(...)`, shifted and scaled at
             will, or a composition.
-        rhs: f, `(n,)` or `(n, c)` for c problems at once; values at bound points do not count.
+        rhs: f, `(n,)` or `(n, c)` for c problems at once, whose conditions have the same values or
+            their own; values at bound points do not count.
         closure: from `js.eliminate` or `js.with_ghosts`.
         preconditioner: `js.multigrid(operator, closure=closure)` if None, also under
             `grad`, and with `mean_zero` under `jit` and `vmap` where the neighbours are concrete.
@@ -132,16 +133,17 @@ def solve(
 @sized_jit
 def _solve(rhs, operator, closure, preconditioner, solver, limits, mean_zero, throw):
     problem = (operator, closure, preconditioner, solver, limits, mean_zero, throw)
+    offset = jnp.zeros(operator.n, rhs.dtype) if closure is None else closure.offset()
     if rhs.ndim == 1:
-        return _solve_one(rhs, *problem)
+        return _solve_one(rhs, offset, *problem)
     columns = lx.Solution(1, 0, 0, 0)  # type: ignore[arg-type]
-    return jax.vmap(lambda f: _solve_one(f, *problem), 1, columns)(rhs)
+    each = (1, 1 if offset.ndim == 2 else None)
+    return jax.vmap(lambda f, e: _solve_one(f, e, *problem), each, columns)(rhs, offset)
 
 
-def _solve_one(rhs, operator, closure, preconditioner, solver, limits, mean_zero, throw):
+def _solve_one(rhs, offset, operator, closure, preconditioner, solver, limits, mean_zero, throw):
     rtol, atol, given, project = limits
     system = System.of(operator, closure, rhs.dtype, mean_zero)
-    offset = jnp.zeros_like(rhs) if closure is None else closure.offset()
     known = rhs if closure is None else system.restriction(rhs - operator(offset))
     inverse = constant(system.inverse(preconditioner))
     found = solve_system(system.matrix, known, solver, inverse)
@@ -215,6 +217,13 @@ def _check(operator, rhs, closure) -> None:
         raise ValueError(
             f"right-hand side has shape {rhs.shape}: no column, one at least is needed"
         )
+    if closure is not None:
+        held = jax.eval_shape(lambda closure: closure.offset(), closure).shape
+        if held[1:] not in ((), rhs.shape[1:]):
+            raise ValueError(
+                f"conditions have values for {held[1]} components, the right-hand side has shape "
+                f"{rhs.shape}"
+            )
     if is_concrete(rhs, closure):
         with at_once():  # constants, while the operator is traced
             values = rhs if closure is None else closure(rhs)

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from ..arguments import as_float, real
+from ..arguments import as_float, real, within_round_off
 from ..boundary import check_border
-from ..failures import check, is_concrete, not_finite, raise_at
+from ..failures import check, is_concrete, not_finite, raise_at, warn
 from .higher import WaveEquation
 from .problem import AbstractEvolution
 from .states import dtype_of, only_on
@@ -152,3 +152,28 @@ def check_coefficients(problem: AbstractEvolution, t0, t1) -> None:
     if is_concrete(t0, t1):
         problem.check(t0)
         problem.check(t1)
+
+
+def tell_small(u0, atol) -> None:
+    """Warn of a state that is smaller than the errors that are allowed."""
+    if not is_concrete(u0, atol):
+        return
+    most = max(float(np.max(np.abs(x), initial=0)) for x in map(np.asarray, jax.tree.leaves(u0)))
+    if 0 < most <= atol:
+        warn(
+            f"u0 is at most {most:.2g} in size and errors of atol = {float(atol):.2g} are allowed: "
+            "the solution may be lost in them; pass a smaller atol"
+        )
+
+
+def check_tolerances(controller: dfx.AbstractStepSizeController, dtype) -> None:
+    """Refuse those that no step meets: it would be tried ever shorter, for ever."""
+    if not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
+        return
+    numbers: dict[str, Any] = {name: getattr(controller, name, None) for name in ("rtol", "atol")}
+    for name, value in numbers.items():
+        if value is None or not is_concrete(value) or jnp.ndim(value):
+            return
+        real(value, f"controller.{name}", least=0)
+    if not numbers["atol"] > 0:
+        within_round_off(numbers["rtol"], dtype, "controller.rtol")

@@ -18,7 +18,15 @@ from ..arguments import instance, real, whole, within_round_off
 from ..failures import is_concrete, is_marking, warn
 from ..functions import Traced, canonical, constant, numbers_as_arrays
 from .amplification import AbstractAmplification, amplification_of
-from .asked import check_coefficients, check_saves, checked_rate, checked_state, checked_times
+from .asked import (
+    check_coefficients,
+    check_saves,
+    check_tolerances,
+    checked_rate,
+    checked_state,
+    checked_times,
+    tell_small,
+)
 from .chebyshev import Loop
 from .explicit import RKC2
 from .guard import Guard, guarded
@@ -190,11 +198,12 @@ def planned(
     if controller is None and dt0 is None:
         within_round_off(rtol, t0.dtype)
         real(atol, "atol", least=0)
+        tell_small(u0, atol)
         shortest = _shortest(t0, t1)
         controller = dfx.PIDController(rtol, atol, dtmin=shortest, force_dtmin=False)
     elif controller is None:
         controller = dfx.ConstantStepSize()
-    _check_tolerances(controller, t0.dtype)
+    check_tolerances(controller, t0.dtype)
     _check_estimates(solver, controller)
     saveat = check_saves(dfx.SaveAt(t1=True) if saveat is None else saveat, t0, t1)
     allowed = _allowed(max_steps, saveat, t0, t1, dt0, controller)
@@ -229,19 +238,6 @@ def _check_estimates(solver: dfx.AbstractSolver, controller) -> None:
             f"solver={type(solver).__name__} estimates no error that would choose the steps: pass "
             "their length as dt0, or the times of all as controller=diffrax.StepTo(...)"
         )
-
-
-def _check_tolerances(controller: dfx.AbstractStepSizeController, dtype) -> None:
-    """Refuse those that no step meets: it would be tried ever shorter, for ever."""
-    if not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
-        return
-    numbers: dict[str, Any] = {name: getattr(controller, name, None) for name in ("rtol", "atol")}
-    for name, value in numbers.items():
-        if value is None or not is_concrete(value) or jnp.ndim(value):
-            return
-        real(value, f"controller.{name}", least=0)
-    if not numbers["atol"] > 0:
-        within_round_off(numbers["rtol"], dtype, "controller.rtol")
 
 
 _LIKE = dict(

@@ -3,9 +3,10 @@
 Of the cache environment variables tell, so that the commands that tests start have it too. Float64
 is not among them: those commands must ask for it themselves.
 
-Most of the time of a test is compilation, of programs that run for milliseconds. So they are
-not optimised (which takes a third of the time that the least does), here and in the experiments and notebooks that tests start. Those still take the
-form of stencils that users' own programs have, and what runs on several devices is optimised fully.
+Most of the time of a test is compilation, of programs that run for milliseconds. So they are not
+optimised (the least that there is takes three times as long), here and in the experiments and
+notebooks that tests start. Those still take the form of stencils that users' own programs have, and
+what runs on several devices is optimised fully.
 """
 
 import importlib.metadata

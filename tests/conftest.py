@@ -3,10 +3,9 @@
 Of the cache environment variables tell, so that the commands that tests start have it too. Float64
 is not among them: those commands must ask for it themselves.
 
-Most of the time of a test is compilation, of programs that run for milliseconds. So they are not
-optimised (the least that there is takes three times as long), here and in the experiments and
-notebooks that tests start. Those still take the form of stencils that users' own programs have, and
-what runs on several devices is optimised fully.
+Most of the time of a test is compilation, of programs that run for milliseconds. So they are
+optimised little, here and in the experiments and notebooks that tests start. Those still take the
+form of stencils that users' own programs have, and what runs on several devices is optimised fully.
 """
 
 import importlib.metadata
@@ -23,7 +22,7 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 _as_users = dict(os.environ)
 # The last one spares threads where processes share the cores. A flag that is unknown ends them all.
-_quick = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=2"]
+_quick = ["--xla_backend_optimization_level=1", "--xla_cpu_parallel_codegen_split_count=2"]
 if importlib.metadata.version("jaxlib").startswith("0.10."):
     _quick.append("--xla_cpu_use_fusion_emitters=false")
 os.environ["XLA_FLAGS"] = " ".join([*_quick, os.environ.get("XLA_FLAGS", "")])

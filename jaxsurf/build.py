@@ -26,14 +26,7 @@ from .failures import (
 from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .indices import mask as checked_mask
 from .machine import TRIED, block
-from .neighbors import (
-    Neighbors,
-    Rows,
-    find_neighbors,
-    nearest_of,
-    switched_on,
-    with_near,
-)
+from .neighbors import Neighbors, Rows, changed, find_neighbors, nearest_of, switched_on
 from .stencils.gathers import take
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood, weights_by
 from .stencils.stencil import Stencil
@@ -91,8 +84,7 @@ def choose_neighbors(
         mask = np.asarray(lists.mask) & needed[:, None]
         return Neighbors(lists.indices, on_device(mask), lists.radius)
 
-    near = neighbors.near
-    return with_near(held(neighbors), None if near is None else held(near))
+    return changed(neighbors, held)
 
 
 def choose_fewer_neighbors(cloud: PointCloud, method: AbstractMethod) -> Neighbors:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -288,9 +290,17 @@ def switched_on(cloud: PointCloud, neighbors: Neighbors) -> Neighbors:
     """The lists less points that are switched off, whatever cloud they were found on."""
     if cloud.active is None or neighbors.n != cloud.n:
         return neighbors
-    mask = _used(cloud.active, neighbors.indices, neighbors.mask)
-    near = None if neighbors.near is None else switched_on(cloud, neighbors.near)
-    return unchecked(Neighbors, neighbors.indices, mask, neighbors.radius, near)
+
+    def used(lists: Neighbors) -> Neighbors:
+        mask = _used(cloud.active, lists.indices, lists.mask)
+        return unchecked(Neighbors, lists.indices, mask, lists.radius)
+
+    return changed(neighbors, used)
+
+
+def changed(lists: Neighbors, change: Callable[[Neighbors], Neighbors]) -> Neighbors:
+    """Lists after a change, and those of the nearest that they know after the same."""
+    return with_near(change(lists), None if lists.near is None else change(lists.near))
 
 
 def with_near(lists: Neighbors, near: Neighbors | None) -> Neighbors:

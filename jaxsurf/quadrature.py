@@ -108,12 +108,13 @@ def _completed(sizes, closed, neighbors):
 def _by_enough(look: Callable, k: int, uneven: bool):
     """What the usual number of sides gives; where that closes not all cells, all neighbours.
 
-    Traced, uneven points are taken to need all.
+    Uneven points are taken to need all, as traced ones cannot be asked.
     """
+    if uneven:
+        return look(k)
     found = look(_CELLS)
     closed = found[1]
-    more = not np.all(closed) if is_concrete(closed) else uneven
-    return look(k) if more else found
+    return look(k) if is_concrete(closed) and not np.all(closed) else found
 
 
 @copying_jit

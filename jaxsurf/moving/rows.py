@@ -15,7 +15,7 @@ from ..borders.order import find_border
 from ..cloud import PointCloud
 from ..compiling import on_device
 from ..discretization import Discretization
-from ..neighbors import Neighbors, find_neighbors, with_near
+from ..neighbors import Neighbors, changed, find_neighbors
 
 # By how much the arrays grow when they are full, at least: all that has been compiled is lost.
 _GROWTH = 1.5
@@ -85,7 +85,7 @@ def compact(surface: Discretization, fields: PyTree[Array]) -> tuple[Discretizat
         border = Border(renamed(border.points), renamed(border.rows), border.mask)
     cloud = PointCloud(kept(cloud.points), kept(cloud.normals), boundary=marked)
     left = lambda some: Neighbors(on_device(row[np.asarray(some.indices)[on]]), kept(some.mask))
-    lists = with_near(left(lists), None if lists.near is None else left(lists.near))
+    lists = changed(lists, left)
     fields = jax.tree.map(kept, fields)
     return Discretization(cloud, lists, surface.method, border), fields
 

@@ -24,8 +24,9 @@ from .curvature import mean_curvature_vector as mean_curvature_vector
 from .curvature import principal_curvatures as principal_curvatures
 from .curvature import shape_tensor as shape_tensor
 from .curvature import tube_ratio as tube_ratio
+from .design.energies import compliance as compliance
+from .design.energies import eigenvalues as eigenvalues
 from .design.functionals import chamfer_distance as chamfer_distance
-from .design.functionals import compliance as compliance
 from .design.functionals import moments as moments
 from .design.functionals import signed_distance as signed_distance
 from .design.functionals import volume as volume

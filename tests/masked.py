@@ -351,9 +351,10 @@ def measured(c: Case):
     targets = np.array([[1.5, 0.0, 0.2], [0.0, -1.2, 0.4]])
     s, u = c.surface, c.u
     numbers = js.volume(s), js.moments(s), js.compliance(s, u), js.chamfer_distance(s, targets)
+    values = js.eigenvalues(s, 4)
     own = c.cloud.points[c.rows[:5]] * jnp.array([1.0, 1.02, 0.98])
     radii = js.medial_radius(s)[c.rows]
-    return *numbers, js.tangent_point_energy(s), radii, js.signed_distance(s, own)
+    return *numbers, values, js.tangent_point_energy(s), radii, js.signed_distance(s, own)
 
 
 def adapted(c: Case, **options):
@@ -584,8 +585,9 @@ BESIDE = {
     "SurfaceDiffusionFlow": "evolve", "WillmoreFlow": "evolve", "Redistribution": "evolve",
     "Evolution": "evolve", "Adaptation": "adapt_points", "Adapted": "adapt_points",
     "Contact": "evolve",
-    "moments": "volume", "compliance": "volume", "chamfer_distance": "volume",
-    "tangent_point_energy": "volume", "medial_radius": "volume", "signed_distance": "volume",
+    "moments": "volume", "compliance": "volume", "eigenvalues": "volume",
+    "chamfer_distance": "volume", "tangent_point_energy": "volume", "medial_radius": "volume",
+    "signed_distance": "volume",
 }  # fmt: skip
 
 # Take bare points, of which none can be switched off, or none at all.

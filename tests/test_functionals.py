@@ -106,6 +106,7 @@ def test_derivatives_of_what_the_surface_does():
         "mean curvature": lambda s: s.integrate(s.mean_curvature),
         "bending": lambda s: s.integrate(s.mean_curvature**2),
         "eigenvalues": lambda s: jnp.sum(js.eigenmodes(s.laplacian, 4).values),
+        "Ritz values": lambda s: jnp.sum(js.eigenvalues(s, 4)),
         "heat content": heat,
         "repulsion": js.tangent_point_energy,
         "thickness": lambda s: jnp.sum(js.medial_radius(s)),

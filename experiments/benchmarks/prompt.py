@@ -238,6 +238,7 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
     ),
     "volume": ("closed", "surface", lambda m: js.volume(m.surface)),
     "moments": ("closed", "surface", lambda m: js.moments(m.surface)),
+    "eigenvalues": ("closed", "surface", lambda m: js.eigenvalues(m.surface, 6)),
     "compliance": ("closed", "surface", lambda m: js.compliance(m.surface, m.u)),
     "chamfer_distance": (
         "closed",

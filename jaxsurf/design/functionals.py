@@ -2,9 +2,9 @@ r"""Numbers that belong to a shape: functions of a discretisation, differentiabl
 
 Many are a line with what a discretisation has already, and have no name here: the area
 `surface.areas.sum()`, the total mean curvature `surface.integrate(surface.mean_curvature)`, the
-Willmore energy `surface.integrate(surface.mean_curvature**2)`, eigenvalues
-`js.eigenmodes(surface.laplacian, k).values`, and a heat content is `surface.inner(w, u)` with
-u from `js.integrate`. Users' own are functions of a discretisation too.
+Willmore energy `surface.integrate(surface.mean_curvature**2)`, and a heat content is
+`surface.inner(w, u)` with u from `js.integrate`. Users' own are functions of a discretisation too.
+Those that are energies, eigenvalues and compliance, are in `energies.py`.
 """
 
 from __future__ import annotations
@@ -16,20 +16,16 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from ..arguments import as_float, finite, instance, real, switched_off
+from ..arguments import as_float, finite, instance, switched_off
 from ..build import determined, residual_tolerance
 from ..compiling import sized_jit
 from ..discretization import Discretization
-from ..failures import is_concrete, needs_values, refuse, without_derivatives
+from ..failures import is_concrete, refuse, without_derivatives
 from ..frames import frames_of
 from ..functions import constant
 from ..interpolation import beyond, distance_and_reach, nearest_points, read_from
 from ..motion import crossed
-from ..solve.steady import solve
 
-# Multiple of round-off that is the tolerance of solves: gradients are as exact as they are. That of
-# the solution alone leaves a residual that grows with the number of points.
-_SOLVE = 1_000
 # Steps that lead to a foot, in the first of which the local polynomial is that of the point of the
 # cloud next to it.
 _STEPS, _FOLLOWED = 40, 10
@@ -53,7 +49,7 @@ def volume(surface: Discretization) -> Float[Array, ""]:
         >>> bool(abs(js.volume(surface) - 4 * jnp.pi / 3) < 1e-4)
         True
     """
-    _closed(surface)
+    closed(surface)
     x, normals = surface.cloud.seen.points, surface.cloud.seen.normals
     height = jnp.sum((x - surface.mean(stop_gradient(x))) * normals, axis=1)
     return surface.integrate(height) / surface.cloud.dim
@@ -85,43 +81,6 @@ def moments(surface: Discretization) -> tuple[Float[Array, " d"], Float[Array, "
     centroid = surface.mean(x)
     about = x - centroid
     return centroid, surface.integrate(about[:, :, None] * about[:, None, :])
-
-
-def compliance(
-    surface: Discretization, f: Float[Array, " n"], *, screening: float = 0.0
-) -> Float[Array, ""]:
-    r"""$\int_S f u\,dS$ with $-\Delta u + \kappa u = f$: how far a load f moves where it acts.
-
-    Args:
-        surface: from `js.discretize`, closed.
-        f: load, `(n,)`.
-        screening: $\kappa \ge 0$ in 1/length², not traced; without it f stands for f less its mean.
-
-    Accuracy: that of the Laplacian; in float32 as `volume` (`tests/test_functionals.py`).
-    Differentiable: forward and reverse, in points, normals and f, by the implicit function theorem.
-    Raises:
-        TypeError: what is no discretisation, a load or a screening that is not made of numbers.
-        ValueError: a load of another shape, a negative or traced screening, a surface with a border
-            (solve with `js.solve` and conditions there).
-        RuntimeError: the linear solve failed.
-
-    Example:
-        >>> surface = js.discretize(js.sphere(500), method=js.GFDM(degree=4))
-        >>> z = surface.cloud.points[:, 2]  # the solution is z / 2
-        >>> bool(abs(js.compliance(surface, z) - 2 * jnp.pi / 3) < 1e-2)
-        True
-    """
-    _closed(surface)
-    f = finite(as_float(f, "load", (surface.n,)), "load", surface.cloud.active)
-    real(screening, "screening", least=0)
-    needs_values("screening", screening, instead="give a number from outside")
-    free = float(screening) == 0
-    if free:
-        f = f - surface.mean(f)
-    operator = -surface.laplacian if free else -surface.laplacian + screening
-    rtol = max(_SOLVE, surface.n) * float(jnp.finfo(f.dtype).eps)
-    u = solve(operator, f, mean_zero=free, project=free, rtol=rtol).value
-    return surface.inner(f, u)
 
 
 def chamfer_distance(surface: Discretization, targets: Float[Array, "m d"]) -> Float[Array, ""]:
@@ -186,7 +145,7 @@ def signed_distance(surface: Discretization, points: Float[Array, "m d"]) -> Flo
         >>> bool(jnp.allclose(found, jnp.array([0.0, -0.1]), atol=1e-4))
         True
     """
-    _closed(surface)
+    closed(surface)
     points = finite(as_float(points, "points", ("m", surface.cloud.dim)), "points")
     cloud, neighbors = surface.cloud.seen, surface.neighbors
     degree = surface.method.polynomial_degree
@@ -306,7 +265,7 @@ def _along(v, n):
     return jnp.sum(v * n, axis=1, keepdims=True)
 
 
-def _closed(surface):
+def closed(surface):
     """Refuse what is no discretisation of a closed surface."""
     instance(surface, Discretization, "surface", "js.discretize(cloud) makes one")
     if surface.border is not None:

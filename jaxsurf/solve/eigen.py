@@ -110,17 +110,32 @@ def eigenmodes(
     if closure is not None:
         instance(closure, Closure, "closure", "js.eliminate(cloud, conditions) makes one")
     check_border(operator, closure)
+    k, degenerate = _asked(operator, k, degenerate)
+    system = _System.of(operator, closure)
+    values, functions, *others = _modes(system, k, degenerate, k)
+    if closure is not None:
+        functions = closure.homogeneous(functions)
+    return Modes(values, functions, *others)
+
+
+def lowest_space(operator: AbstractOperator, k: int, degenerate: float) -> Float[Array, "n K"]:
+    """Functions of the lowest k modes of minus an operator, and of those in the groups of these.
+
+    A basis as `eigenmodes` has it, with its derivatives; columns beyond the last group are zero.
+    """
+    k, degenerate = _asked(operator, k, degenerate)
+    _, functions, _, _, groups = _modes(_System.of(operator, None), k, degenerate, None)
+    return jnp.where(groups <= groups[k - 1], functions, 0)
+
+
+def _asked(operator: AbstractOperator, k: int, degenerate: float) -> tuple[int, float]:
     k, degenerate = whole(k, "k"), float(real(degenerate, "degenerate", least=0, below=1))
     n = operator.n
     if is_concrete(operator.active):
         n = int(count_on(operator.active, n))
     if not 1 <= k <= n // 2:
         raise ValueError(f"k = {k} modes, between 1 and n / 2 = {n // 2} can be computed")
-    system = _System.of(operator, closure)
-    values, functions, *others = _modes(system, k, degenerate)
-    if closure is not None:
-        functions = closure.homogeneous(functions)
-    return Modes(values, functions, *others)
+    return k, degenerate
 
 
 class _System(eqx.Module):
@@ -155,35 +170,36 @@ def _free(closure: Closure) -> Bool[Array, " n"]:
 
 
 @eqx.filter_custom_jvp
-def _modes(system: _System, k: int, degenerate: float):
-    return _results(system, _subspace(system, k, degenerate, left=False), k)
+def _modes(system: _System, k: int, degenerate: float, count: int | None):
+    """The first `count` of the modes computed, or all, of which k are in complete groups."""
+    return _results(system, _subspace(system, k, degenerate, left=False), count)
 
 
 @_modes.def_jvp
 def _modes_jvp(primals, tangents):
-    system, k, degenerate = primals
+    system, k, degenerate, count = primals
     space = _subspace(system, k, degenerate, left=True)
-    values, functions, *others = _results(system, space, k)
+    values, functions, *others = _results(system, space, count)
     if not jax.tree.leaves(tangents[0]):
         return (values, functions, *others), (None,) * 5
 
-    values_dot, functions_dot = _tangents(system, tangents[0], space, k)
-    return (values, functions, *others), (values_dot, functions_dot, None, None, None)
+    dots = (dot[..., :count] for dot in _tangents(system, tangents[0], space, k))
+    return (values, functions, *others), (*dots, None, None, None)
 
 
 def _tangents(system: _System, system_dot: _System, space: Subspace, k: int):
-    """Of values and functions."""
+    """Of values and functions; zero for the functions of groups that nobody asked for."""
     # The tangent of M V, with V held.
     change = eqx.filter_jvp(lambda m: m(space.right), (system,), (system_dot,))[1]
     same = space.groups[:, None] == space.groups
     # Within a group: that of an eigenvalue is y^H dM x, with its left and right vectors.
     inner = jnp.where(same, space.left.T @ change, 0)
-    values_dot = jnp.einsum("ia,ab,bi->i", space.unmix, inner, space.mix).real[:k]
+    values_dot = jnp.einsum("ia,ab,bi->i", space.unmix, inner, space.mix).real
     # Out of the group: M dV - dV B = -(1 - V W^T) dM V turns its space.
     wanted = space.groups <= space.groups[k - 1]
     turn = _sylvester(system, space, jnp.where(wanted, space.right @ inner - change, 0))
     basis = lambda span: _basis(span, same, _reference(system, k))
-    functions_dot = jax.jvp(basis, (space.right,), (turn,))[1][:, :k]
+    functions_dot = jax.jvp(basis, (space.right,), (turn,))[1]
     functions_dot = functions_dot * jnp.sqrt(jnp.sum(system.free).astype(functions_dot.dtype))
     return values_dot.astype(space.values.dtype), functions_dot
 
@@ -239,11 +255,11 @@ def _noise(n: int, count: int, dtype) -> Float[Array, "n K"]:
 
 
 @eqx.filter_jit
-def _results(system: _System, space: Subspace, k: int):
-    functions = space.right[:, :k]
-    residual = system(functions) - space.right @ space.block[:, :k]
+def _results(system: _System, space: Subspace, count: int | None):
+    functions = space.right[:, :count]
+    residual = system(functions) - space.right @ space.block[:, :count]
     residuals = jnp.linalg.norm(residual, axis=0) / jnp.linalg.norm(functions, axis=0)
-    return space.values[:k], functions, space.imaginary[:k], residuals, space.groups[:k]
+    return space.values[:count], functions, space.imaginary[:count], residuals, space.groups[:count]
 
 
 def _basis(span, same, reference):
@@ -330,7 +346,7 @@ def _spread(tree, free, n: int, dtype):
     """Rows of free points put in their places among all n, numbers in the precision asked for."""
 
     def one(a):
-        kind = np.result_type(dtype, complex) if np.iscomplexobj(a) else dtype
+        kind = jnp.result_type(dtype, complex) if np.iscomplexobj(a) else dtype
         kind = jnp.result_type(int) if a.dtype.kind == "i" else kind
         return a.astype(kind)
 

@@ -1,6 +1,6 @@
 """Shapes as unknowns."""
 
-_TAYLOR = "test_taylor.py::"
+_TAYLOR, _ENERGY = "test_taylor.py::", "test_energies.py::"
 _FUN, _SHAPE = "test_functionals.py::", "test_design.py::"
 _CURVES = _FUN + "test_curves_compiled_mapped_and_in_single_precision"
 _MOVED = {"points, normals": _FUN + "test_derivatives_in_the_geometry"}
@@ -69,8 +69,18 @@ TESTED = {
         "float32": _CURVES,
         "bad input": "malformed",
     },
+    "eigenvalues": {
+        "value": _ENERGY + "test_values_and_shape_derivatives_on_the_torus, "
+        "test_energies.py::test_ritz_values_of_a_group_that_k_cuts_off",
+        "gradient": {"points, normals": _FUN + "test_derivatives_of_what_the_surface_does"},
+        "jit": _ENERGY + "test_eigenvalues_mapped_and_in_single_precision",
+        "vmap": _ENERGY + "test_eigenvalues_mapped_and_in_single_precision",
+        "float32": _ENERGY + "test_eigenvalues_mapped_and_in_single_precision",
+        "bad input": "malformed",
+    },
     "compliance": {
-        "value": _FUN + "test_compliance_of_the_ball",
+        "value": _ENERGY + "test_values_and_shape_derivatives_on_the_torus, "
+        "test_functionals.py::test_compliance_of_the_ball",
         "gradient": {**_MOVED, "f": _FUN + "test_compliance_of_the_ball"},
         "jit": _CURVES,
         "vmap": _CURVES,

@@ -13,7 +13,7 @@ from .adapt import dominance, is_better, represented, share_wanted, sizes_to_try
 from .adapt import residual_tolerance as residual_tolerance
 from .arguments import as_many, instance, whole
 from .cloud import PointCloud
-from .compiling import at_once, copying_jit, namespace, on_device, pieces_jit
+from .compiling import at_once, copying_jit, namespace, on_device, pieces_jit, sized_jit
 from .failures import (
     is_concrete,
     needs_values,
@@ -23,6 +23,7 @@ from .failures import (
     warn,
     without_derivatives,
 )
+from .fits.graph import Graph
 from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .indices import mask as checked_mask
 from .machine import TRIED, block
@@ -110,8 +111,13 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     _check_sizes(cloud, neighbors, method, target, throw)
     if weights is None:
         weights = stencil_weights(cloud, neighbors, method, target)
-    values, diagnostics = weights
-    components = values.shape[1:-1]
+    stencil = _stencil(cloud, neighbors, *weights)
+    if throw and is_concrete(stencil.weights):
+        _check(stencil, neighbors, method, target, cloud.dim)
+    return stencil
+
+
+def _stencil(cloud, neighbors, values, diagnostics) -> Stencil:
     border = cloud.boundary
     if border is not None and cloud.active is not None:
         border = border & cloud.active
@@ -119,10 +125,29 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     # Lists that are known stay known in compiled code: transposes can gather there.
     with at_once() if is_concrete(neighbors.indices) else nullcontext():
         slots = _slots_first(neighbors.indices)
-    stencil = unchecked(Stencil, slots, values, components, (), *known)
-    if throw and is_concrete(values):
-        _check(stencil, neighbors, method, target, cloud.dim)
-    return stencil
+    return unchecked(Stencil, slots, values, values.shape[1:-1], (), *known)
+
+
+def build_with_surfaces(cloud, neighbors, method, target) -> tuple[Stencil, tuple]:
+    """The operator, and the surface over each tangent plane (`Graph.of`) in blocks; traced clouds.
+
+    In one program, where the compiler finds that both need the same moments, and sums them once.
+    """
+    neighbors = switched_on(cloud, neighbors)
+    _check_sizes(cloud, neighbors, method, target, True)
+    rows = np.arange(cloud.n, dtype=np.int32)
+    blocks = blocks_of(cloud, neighbors, rows, block(method.batch_size))
+    weights, surfaces = _weights_and_surfaces(blocks, method, target)
+    return _stencil(cloud, neighbors, *rows_of(*weights, cloud.n)), surfaces
+
+
+@sized_jit
+def _weights_and_surfaces(blocks, method, target):
+    def both(block):
+        around = neighborhood(block)
+        return weights_by(method, around, target), Graph.of(around, method.polynomial_degree)
+
+    return blockwise(both, blocks)
 
 
 def stencil_weights(

@@ -14,7 +14,7 @@ from .borders.border import Border
 from .borders.order import find_border
 from .build import choose_neighbors
 from .cloud import PointCloud
-from .failures import is_concrete, needs_values
+from .failures import is_concrete, needs_values, without_derivatives
 from .interpolation import interpolated
 from .kept import Kept
 from .motion import code_of, folded, moved_cloud, raise_for
@@ -72,12 +72,12 @@ class Discretization(eqx.Module):
     @property
     def laplacian(self) -> Stencil:
         """Laplace–Beltrami operator, see `laplace_beltrami`."""
-        return self._joint[0] if self.method.shares_moments else self._laplacian
+        return self._built.laplacian
 
     @property
     def gradient(self) -> Stencil:
         """Gradient along the surface, see `surface_gradient`."""
-        return self._joint[1] if self.method.shares_moments else self._gradient
+        return self._built.gradient if self.method.shares_moments else self._gradient
 
     @property
     def divergence(self) -> Stencil:
@@ -125,12 +125,18 @@ class Discretization(eqx.Module):
         return symmetrised(self.laplacian, self.cloud, self.neighbors, self.cell_areas, self.border)
 
     @Kept
-    def _joint(self) -> tuple[Stencil, Stencil]:
-        return operators.laplacian_and_gradient(self.cloud, self.neighbors, self.method)
+    def _built(self) -> operators.Built:
+        where = self.cloud, self.neighbors, self.method
+        return operators.built(*where, self._is_fitted_once)
 
-    @Kept
-    def _laplacian(self) -> Stencil:
-        return operators.laplace_beltrami(self.cloud, self.neighbors, method=self.method)
+    @property
+    def _is_fitted_once(self) -> bool:
+        """Whether areas take the surface from where the operators are built.
+
+        In compiled code only, where what nobody asks for is left out.
+        """
+        compiled = not is_concrete(without_derivatives(self.cloud))
+        return compiled and quadrature.shares_fits(self.neighbors, self.method)
 
     @Kept
     def _gradient(self) -> Stencil:
@@ -211,7 +217,9 @@ class Discretization(eqx.Module):
 
     @property
     def _bounds(self):
-        return quadrature.cells_of(self.cloud, self.neighbors, self.method, self.border)
+        surfaces = self._built.surfaces if self._is_fitted_once else None
+        where = self.cloud, self.neighbors, self.method, self.border
+        return *quadrature.cells_of(*where), surfaces
 
     def integrate(self, u: Float[Array, "n *c"]) -> Float[Array, "*c"]:
         r"""$\int_S u\,dS$ of a field or of each of its components."""
@@ -321,13 +329,12 @@ class Discretization(eqx.Module):
 
     def _renewed(self, cloud: PointCloud, search: NeighborSearch) -> Discretization:
         """The surface of another cloud of the same points, with neighbours of its own."""
-        neighbors, found, operators = renewed(search, cloud, self.neighbors, _operators)
+        once = Discretization(cloud, self.neighbors, search.method)._is_fitted_once
+        neighbors, found, built = renewed(search, cloud, self.neighbors, once)
         # What has turned no list found anew would hold.
         found = jnp.where(folded(cloud, self.neighbors), 2, found)
         surface = Discretization(cloud, neighbors, search.method, self.border, found=found)
-        name = "_joint" if search.method.shares_moments else "_laplacian"
-        kept = operators if search.method.shares_moments else operators[0]
-        vars(surface)["_kept"] = {name: kept}
+        vars(surface)["_kept"] = {"_built": built}
         return surface
 
     @Kept
@@ -391,9 +398,3 @@ def discretize(
     if cloud.boundary is not None and (np.asarray(cloud.boundary) & cloud.host_active).any():
         border = find_border(cloud)
     return Discretization(cloud, neighbors, method, border)
-
-
-def _operators(cloud, neighbors, method) -> tuple[Stencil, ...]:
-    """The Laplacian, and what comes with it for nothing."""
-    surface = Discretization(cloud, neighbors, method)
-    return surface._joint if method.shares_moments else (surface._laplacian,)

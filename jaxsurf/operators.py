@@ -2,7 +2,7 @@ r"""Differential operators on point clouds: on surfaces, and in flat space."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .arguments import POINTS, as_float, finite, instance, switched_off, whole
-from .build import build
+from .build import build, build_with_surfaces
 from .cloud import PointCloud
 from .compiling import copying_jit
 from .failures import is_concrete, refuse, without_derivatives
@@ -103,11 +103,30 @@ def surface_gradient(
     return build(cloud, neighbors, method, Gradient(), throw)
 
 
-def laplacian_and_gradient(cloud, neighbors, method) -> tuple[Stencil, Stencil]:
-    """Both from one factorisation of the moment matrices."""
-    both = build(cloud, neighbors, method, Joint((Laplacian(), Gradient())), True)
-    laplacian, gradient = _first_and_others(both.weights)
-    return both.of_weights(laplacian), both.of_weights(gradient, (cloud.dim,))
+class Built(NamedTuple):
+    """The Laplacian, and what comes with it for nothing.
+
+    Args:
+        gradient: from the same factorisation of the moment matrices; None if these are not shared.
+        surfaces: over the tangent planes, see `build_with_surfaces`.
+    """
+
+    laplacian: Stencil
+    gradient: Stencil | None = None
+    surfaces: tuple | None = None
+
+
+def built(cloud, neighbors, method, with_surfaces: bool = False) -> Built:
+    """As `laplace_beltrami`; with surfaces if they are wanted and the method shares its moments."""
+    if not method.shares_moments:
+        return Built(laplace_beltrami(cloud, neighbors, method=method))
+    both, surfaces = Joint((Laplacian(), Gradient())), None
+    if with_surfaces:
+        found, surfaces = build_with_surfaces(cloud, neighbors, method, both)
+    else:
+        found = build(cloud, neighbors, method, both, True)
+    laplacian, gradient = _first_and_others(found.weights)
+    return Built(found.of_weights(laplacian), found.of_weights(gradient, (cloud.dim,)), surfaces)
 
 
 @copying_jit

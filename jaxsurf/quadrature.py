@@ -48,15 +48,22 @@ def cells_of(cloud: PointCloud, neighbors: Neighbors, method: AbstractMethod, bo
     return cloud, neighbors, degree, outward
 
 
+def shares_fits(neighbors: Neighbors, method: AbstractMethod) -> bool:
+    """Whether surfaces in blocks may come from where a method's stencils are built."""
+    same = neighbors.near is None and block(method.batch_size) == block(CELLS)
+    return method.shares_moments and same
+
+
 def areas(
     cloud: PointCloud,
     neighbors: Neighbors,
     degree: int,
     outward: Float[Array, "n d"] | None,
+    surfaces: tuple[TangentPlane, Graph] | None = None,
 ) -> Float[Array, " n"]:
     """Weights of the points in integrals over the surface; arguments as of `cell_weights`."""
     uneven, neighbors = neighbors.near is not None, neighbors.nearest
-    look = lambda cells: cell_weights(cloud, neighbors, degree, cells, outward)
+    look = lambda cells: cell_weights(cloud, neighbors, degree, cells, outward, surfaces)
     weights, closed, residual = _by_enough(look, neighbors.k, uneven)
     more = 2 * neighbors.k
     text = (
@@ -65,8 +72,8 @@ def areas(
         f"js.discretize(cloud, js.find_neighbors(cloud, k={more}))"
     )
     bad, count = _open(closed, neighbors.mask)
-    weights = refuse(weights, bad, text, count)
-    return _summed(determined(weights, residual, degree), neighbors.indices)
+    found = refuse(_summed(weights, neighbors.indices), bad, text, count)
+    return determined(found, residual, degree)
 
 
 def cell_areas(
@@ -74,13 +81,14 @@ def cell_areas(
     neighbors: Neighbors,
     degree: int,
     outward: Float[Array, "n d"] | None,
+    surfaces: tuple[TangentPlane, Graph] | None = None,
 ) -> Float[Array, " n"]:
     """Areas of the cells themselves, arguments as of `cell_weights`.
 
     Where neighbours do not close a cell, as at folds of a scan, the mean of theirs, with a warning.
     """
     uneven, neighbors = neighbors.near is not None, neighbors.nearest
-    look = lambda cells: _cell_sizes(cloud, neighbors, degree, cells, outward)
+    look = lambda cells: _cell_sizes(cloud, neighbors, degree, cells, outward, surfaces)
     sizes, closed = _by_enough(look, neighbors.k, uneven)
     if is_concrete(closed) and not np.all(closed):
         warn(
@@ -149,6 +157,7 @@ def cell_weights(
     degree: int,
     cells: int,
     outward: Float[Array, "n d"] | None,
+    surfaces: tuple[TangentPlane, Graph] | None = None,
 ) -> tuple[Float[Array, "k n"], Bool[Array, " n"], Float[Array, " n"]]:
     """Weights of the neighbours in the integral over each cell, and what may be wrong with it.
 
@@ -156,19 +165,20 @@ def cell_weights(
         degree: of the polynomials.
         cells: the first so many neighbours may bound a cell, the point itself included.
         outward: conormals where the surface ends, zero elsewhere.
+        surfaces: the surface over each tangent plane, in blocks; None: to be fitted.
 
     Returns:
         Weights `(k, n)`; whether each cell is bounded by neighbours so near that no other
         point can have a part of it; the relative moment residual of its weights.
     """
-    planes, mask, moments, closed = _cells(cloud, neighbors, degree, cells, outward)
+    planes, mask, moments, closed = _cells(cloud, neighbors, degree, cells, outward, surfaces)
     weights, residual = _weights_of_blocks(planes, mask, moments, degree)
     weights, (closed, residual) = rows_of(weights, (closed, residual), cloud.n)
     return weights, *_where_on(neighbors.mask, closed, residual)
 
 
-def _cell_sizes(cloud, neighbors, degree, cells, outward):
-    planes, _, moments, closed = _cells(cloud, neighbors, degree, cells, outward)
+def _cell_sizes(cloud, neighbors, degree, cells, outward, surfaces):
+    planes, _, moments, closed = _cells(cloud, neighbors, degree, cells, outward, surfaces)
     sizes = _scaled(planes.width, planes.points.shape[1], moments)
     _, (sizes, closed) = rows_of(moments, (sizes, closed), cloud.n)
     closed, sizes = _where_on(neighbors.mask, closed, sizes)
@@ -186,27 +196,29 @@ def _where_on(mask, closed, values):
     return closed | ~on, namespace(values).where(on, values, 0)
 
 
-def _cells(cloud, neighbors, degree, cells, outward):
+def _cells(cloud, neighbors, degree, cells, outward, surfaces):
     """Planes, masks and moments of all cells in blocks, and whether they are closed."""
-    blocks = blocks_of(cloud, neighbors, np.arange(cloud.n, dtype=np.int32), block(CELLS))
-    lines = None if outward is None else in_blocks(outward.T, block(CELLS))
-    mask, cells = blocks[2], min(cells, neighbors.k)
+    size, cells = block(CELLS), min(cells, neighbors.k)
+    lines = None if outward is None else in_blocks(outward.T, size)
     # Programs of their own: in one, the compiler finds much again for every use of it, and a
     # derivative took fifteen times as long as the value.
-    planes, graphs = _surfaces(blocks, degree)
+    if surfaces is None:
+        rows = np.arange(cloud.n, dtype=np.int32)
+        surfaces = _surfaces(blocks_of(cloud, neighbors, rows, size), degree)
+    mask = _in_blocks(neighbors.mask, size)
+    planes, graphs = surfaces
     ways = _ways_of_blocks(*jax.lax.stop_gradient((planes, mask, lines)), cells)
     return planes, mask, *_moments_of_blocks(planes, graphs, mask, lines, ways, cells)
 
 
+@copying_jit
+def _in_blocks(mask, size: int):
+    return in_blocks(mask.T, size)
+
+
 @sized_jit
 def _surfaces(blocks, degree: int):
-    """The tangent planes, and the surface as a polynomial over each."""
-
-    def fit(block):
-        plane = TangentPlane.of(neighborhood(block), degree)
-        return plane, Graph(plane.surface(1, degree)[0], degree, len(plane.points))
-
-    return blockwise(fit, blocks)
+    return blockwise(lambda block: Graph.of(neighborhood(block), degree), blocks)
 
 
 @sized_jit

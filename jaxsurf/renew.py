@@ -28,6 +28,7 @@ from .failures import unchecked
 from .machine import COUNTED, SHEETS, TRIED, block
 from .nearest import Grid, Nearest, nearest_in
 from .neighbors import Neighbors, Rows, with_near
+from .operators import Built, built
 from .sheets import cosine_slack
 from .stencils.method import AbstractMethod
 from .stencils.targets import Laplacian
@@ -133,28 +134,29 @@ def _candidates(grid, reach: int):
 
 @sized_jit
 def renewed(
-    search: NeighborSearch, cloud: PointCloud, before: Neighbors, operators: Callable
-) -> tuple[Neighbors, Int[Array, " n"], tuple]:
+    search: NeighborSearch, cloud: PointCloud, before: Neighbors, with_surfaces: bool
+) -> tuple[Neighbors, Int[Array, " n"], Built]:
     """Lists of a moved cloud, a code for each, and operators that are built with them.
+
+    These are differentiated; all the rest is constant.
 
     Args:
         before: lists of the same points before they moved. They say how far to look; a row without
             room for a new list keeps that one.
-        operators: of a cloud, its neighbours and a method, the Laplacian first. They are
-            differentiated; all the rest is constant.
+        with_surfaces: as of `built`.
     """
     fixed = jax.tree.map(jax.lax.stop_gradient, cloud)
     usual, code, (grid, rings) = usual_lists(search, fixed, before)
-    built = operators(cloud, usual, search.method)
+    operators = built(cloud, usual, search.method, with_surfaces)
     # Where the lists before had none, those of all points are even, or nearly.
     near = None if before.near is None else usual
     if not search.sizes:
-        return with_near(usual, near), code, built
+        return with_near(usual, near), code, operators
     lists = _Lists(usual.indices.T, usual.mask.T, code)
-    lists, changed = _adapted(search, grid, rings, fixed, lists, built[0])
+    lists, changed = _adapted(search, grid, rings, fixed, lists, operators.laplacian)
     adapted = _padded(lists, before, search.slots)
-    again = lambda: operators(cloud, adapted, search.method)
-    return with_near(adapted, near), lists.code, jax.lax.cond(changed, again, lambda: built)
+    again = lambda: built(cloud, adapted, search.method, with_surfaces)
+    return with_near(adapted, near), lists.code, jax.lax.cond(changed, again, lambda: operators)
 
 
 def usual_lists(search: NeighborSearch, cloud: PointCloud, before: Neighbors):

@@ -9,6 +9,7 @@ import optax
 import pytest
 
 import jaxsurf as js
+from jaxsurf.shapes.spacing import measure_quality
 
 from .helpers import count_compilations
 
@@ -21,6 +22,9 @@ LBFGS, ADAM = optax.lbfgs(), optax.adam(0.05)
 @functools.cache
 def ball(n=200):
     return js.discretize(js.sphere(n), method=METHOD)
+
+
+BALL = jnp.zeros(16).at[0].set(np.sqrt(4 * np.pi))
 
 
 def scaled(x, axes):
@@ -307,22 +311,82 @@ def test_free_form_keeps_its_parameters_where_the_reference_is_another():
     np.testing.assert_allclose(along, found.theta - found.shape.start, atol=1e-12)
 
 
+def closest(surface):
+    x = np.asarray(surface.cloud.points)
+    apart = np.linalg.norm(x[np.asarray(surface.neighbors.indices)[:, 1:7]] - x[:, None], axis=2)
+    return apart.min(axis=1)
+
+
+def evenness(surface):
+    """The least distance of two points, in units of the spacing that even ones would have."""
+    measure = float(surface.areas.sum())
+    return measure_quality(np.asarray(surface.cloud.points), measure=measure).smallest
+
+
 def test_level_sets_are_spread_evenly_again():
     phi = lambda x, axes: jnp.sum((x / axes) ** 2) - 1
     shape = js.LevelSetShape(phi, ball())
     axes = jnp.array([1.4, 1.0, 1.0])
     before = shape(axes)
     after = shape.renewed(axes, before.search())(axes)
-
-    def closest(surface):
-        x = np.asarray(surface.cloud.points)
-        apart = np.linalg.norm(
-            x[np.asarray(surface.neighbors.indices)[:, 1:7]] - x[:, None], axis=2
-        )
-        return apart.min(axis=1)
-
     assert closest(after).min() > 1.1 * closest(before).min()
     assert float(jnp.abs(jnp.sum((after.cloud.points / axes) ** 2, axis=1) - 1).max()) < 1e-12
+
+
+def test_stars_and_maps_are_spread_evenly_again():
+    """The same surface at the same parameters, on points of the reference that move."""
+    radius = jnp.linalg.norm
+    axes = jnp.array([0.6, 1.0, 1.0])
+
+    def onto(x):
+        x = x / radius(x, axis=1, keepdims=True)
+        return x, x
+
+    lobes = jnp.zeros(16).at[0].set(np.sqrt(4 * np.pi)).at[6].set(1.0)
+    star = js.star_shape(ball(), 3, even=True)
+    ellipsoid = js.MappedShape(lambda x, axes: axes * x, ball(), onto)
+    for shape, theta in ((star, lobes), (ellipsoid, axes)):
+        before = shape(theta)
+        anew = shape
+        for _ in range(3):
+            anew = anew.renewed(theta, anew(theta).search())
+        after = anew(theta)
+        assert evenness(after) > 0.8 > 0.75 > evenness(before)
+        x, reference = after.cloud.points, anew.base.cloud.points
+        assert float(jnp.abs(radius(reference, axis=1) - 1).max()) < 1e-12
+        # Its own map takes the reference to it, and it is the surface that it was.
+        fresh = shape.f(reference[7], theta)
+        np.testing.assert_allclose(x[7], fresh, rtol=1e-12)
+        np.testing.assert_allclose(after.areas.sum(), before.areas.sum(), rtol=2e-3)
+        np.testing.assert_allclose(radius(after.cloud.normals, axis=1), 1, rtol=1e-12)
+        assert not after.code.any()
+
+
+def test_points_are_spread_on_the_way_and_no_step_compiles():
+    """From the ball to an egg; the optimiser keeps its state, and nothing is compiled again."""
+    lobes = BALL.at[6].set(1.0)
+    volume, (_, wanted) = (f(js.star_shape(ball(), 3)(lobes)) for f in (js.volume, js.moments))
+
+    def off(surface):
+        center, second = js.moments(surface)
+        return jnp.mean((second - wanted) ** 2) + center @ center
+
+    def run(even, seen, names):
+        return js.optimize_shape(
+            off, js.star_shape(ball(), 3, even=even), BALL, optimizer=optax.lbfgs(), steps=40,
+            equalities={"volume": lambda surface: js.volume(surface) - volume},
+            callback=lambda so_far: seen.append((len(names), so_far.history["renewed"].sum())),
+        )  # fmt: skip
+
+    usual = run(False, [], [])
+    with count_compilations() as names:
+        seen = []
+        even = run(True, seen, names)
+    assert usual.converged and even.converged
+    assert evenness(even.surface) > 1.1 * evenness(usual.surface)
+    renewed = [count for _, count in seen]
+    first = next(i for i, count in enumerate(renewed) if count)
+    assert seen[-1][0] == seen[first][0], "compiled between steps"
 
 
 def test_single_precision():

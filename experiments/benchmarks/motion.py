@@ -113,7 +113,7 @@ def step(n: int) -> dict:
         "build": jax.jit(lambda x: fresh(x).laplacian.weights),
         "neighbours": jax.jit(lambda x: usual_lists(search, fresh(x).cloud, surface.neighbors)[:2]),
         "normals": jax.jit(lambda x: carried(gradient, normals, x / 1.01, x)),
-        "stencils": jax.jit(lambda x: [o.weights for o in fresh(x)._joint]),
+        "stencils": jax.jit(lambda x: [o.weights for o in fresh(x)._built[:2]]),
         "solve": lambda _: jax.jit(solved)(surface.laplacian.weights, u),
         # Which touches nothing here: what is looked at in vain.
         "adaptation": lambda _: changed(surface, u, adapt, spacing)[2:],

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..arguments import as_float, instance, shaped, whole
+from ..arguments import as_float, flag, instance, shaped, whole
 from ..discretization import Discretization
 from ..failures import check
 from .shape import MappedShape
@@ -75,13 +75,15 @@ def _harmonics(directions, degree: int):
     return jnp.stack([found[at] for at in order], axis=-1)
 
 
-def star_shape(surface: Discretization, degree: int) -> MappedShape:
+def star_shape(surface: Discretization, degree: int, *, even: bool = False) -> MappedShape:
     r"""Star-shaped surfaces $\{r(\omega)\,\omega\}$, $r = \sum_{lm} \theta_{lm} Y_{lm}(\omega)$.
 
     Args:
         surface: the reference, in which every direction from the origin has one point, as in a
             `js.sphere`.
         degree: of the harmonics, at least 0.
+        even: spread points evenly over the surface again where `js.optimize_shape` finds neighbours
+            anew, see `onto` of `MappedShape`.
 
     Returns:
         The shape with parameters `((degree + 1)²,)` in the order of `spherical_harmonics`; the
@@ -110,4 +112,10 @@ def star_shape(surface: Discretization, degree: int) -> MappedShape:
         direction = x / jnp.linalg.norm(x)
         return (spherical_harmonics(direction, degree) @ theta) * direction
 
-    return MappedShape(star, surface)
+    return MappedShape(star, surface, _directions if flag(even, "even") else None)
+
+
+def _directions(x):
+    """On the unit sphere, which any reference may be replaced by."""
+    x = x / jnp.linalg.norm(x, axis=1, keepdims=True)
+    return x, x

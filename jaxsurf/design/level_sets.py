@@ -17,20 +17,17 @@ from ..neighbors import Neighbors, find_neighbors
 from ..renew import NeighborSearch
 from ..shapes.implicit import Bounds, level_set_normals, project_to_level_set
 from ..shapes.level_sets import RESOLUTION, spread, watched
-from ..shapes.sampling import relax
-from ..shapes.spacing import ideal_spacing
 from ..shapes.topology import Sides, checked_bounds
 from .shape import (
     AbstractShape,
     check_function,
     check_surface,
     geometry,
+    spread_evenly,
     unchecked_surface,
     with_lists,
 )
 
-# Steps of repulsion by which points are spread again.
-_SPREAD = 10
 # A sheet gets points if they fill so many stencils; with fewer than wanted by this factor it is
 # sampled anew.
 _STENCILS, _FEWER = 2, 4
@@ -121,9 +118,7 @@ class LevelSetShape(AbstractShape):
                 x = project_to_level_set(phi, jnp.asarray(x, cloud.points.dtype), throw=False)
                 return x, level_set_normals(phi, x)
 
-            spacing = ideal_spacing(float(jnp.sum(surface.areas)), cloud.n, dim=cloud.dim)
-            even = relax(np.asarray(cloud.points), onto, spacing=spacing, steps=_SPREAD)
-            points, normals = (jnp.asarray(a, cloud.points.dtype) for a in even)
+            points, normals = spread_evenly(surface, onto)
         else:
             points, normals = geometry(surface)
         found = surface.moved(points, normals, search=search)

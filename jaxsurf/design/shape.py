@@ -9,6 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..arguments import as_float, differentiable, finite, instance, pair, switched_off
@@ -20,6 +21,8 @@ from ..functions import Traced, canonical
 from ..motion import crossed
 from ..normals import refit_normals
 from ..renew import NeighborSearch
+from ..shapes.sampling import relax
+from ..shapes.spacing import ideal_spacing
 
 
 class AbstractShape(eqx.Module):
@@ -97,11 +100,16 @@ class MappedShape(AbstractShape):
     Args:
         f: takes one point `(d,)` and parameters, any pytree; returns a point.
         base: what it is applied to.
+        onto: takes points `(n, d)` next to the reference to it; returns points and unit normals.
+            With it `renewed` spreads points evenly over the surface again, by moving those of the
+            reference. Then no number of an objective may belong to a point, as a load given by an
+            array, or a point by its index, would.
 
     Differentiable: forward and reverse in theta, for fixed neighbours.
     Raises:
-        TypeError: f that is no function, a base that is neither discretisation nor shape.
-        ValueError: at a theta for which f returns no point, or folds or flattens the surface.
+        TypeError: f or onto that is no function, a base that is neither discretisation nor shape.
+        ValueError: at a theta for which f returns no point, or folds or flattens the surface; an
+            onto for a shape, or for a surface with border or mask.
 
     Example:
         >>> surface = js.discretize(js.sphere(500), method=js.GFDM(degree=4))
@@ -114,10 +122,19 @@ class MappedShape(AbstractShape):
 
     f: Callable[[Float[Array, " d"], PyTree], Float[Array, " d"]]
     base: Discretization | AbstractShape
+    onto: Callable[[Float[Array, "n d"]], tuple[Array, Array]] | None = None
 
     def __check_init__(self):
         check_function(self.f, "f")
         instance(self.base, (Discretization, AbstractShape), "base", "js.discretize makes one")
+        if self.onto is None:
+            return
+        check_function(self.onto, "onto")
+        if isinstance(self.base, AbstractShape):
+            raise ValueError("onto is for a surface that is mapped: base is a shape")
+        for name in ("boundary", "active"):
+            if getattr(self.base.cloud, name) is not None:
+                raise ValueError(f"onto is for surfaces without {name}: this one has some")
 
     def __call__(self, theta: PyTree) -> Discretization:
         if isinstance(self.base, AbstractShape):
@@ -126,32 +143,81 @@ class MappedShape(AbstractShape):
         else:
             surface = self.base
         points, normals = surface.cloud.seen.points, surface.cloud.seen.normals
+        images, normals, area = _mapped(self._program(theta, points), points, normals)
+        text = "f flattens the surface at point {i}: it stretches areas there by {v}"
+        on = surface.cloud.active
+        check(switched_off(on, area, 1), not_positive, text)
+        return surface.moved(images, switched_off(on, normals, surface.cloud.normals))
+
+    def _program(self, theta: PyTree, points: Float[Array, "n d"]) -> Traced:
+        """The map of one point."""
         point = jax.ShapeDtypeStruct(points.shape[1:], points.dtype)
         apply = lambda x: self.f(x, theta)
         found = differentiable(apply, "f", point)
         if getattr(found, "shape", None) != point.shape:
             what = getattr(found, "shape", type(found).__name__)
             raise ValueError(f"f returns {what} for one point, expected {point.shape}")
-        program = canonical(apply, jnp.zeros(point.shape, point.dtype))
-        images, normals, area = _mapped(program, points, frames_of(normals)[:, :-1])
-        text = "f flattens the surface at point {i}: it stretches areas there by {v}"
-        on = surface.cloud.active
-        check(switched_off(on, area, 1), not_positive, text)
-        return surface.moved(images, switched_off(on, normals, surface.cloud.normals))
+        return canonical(apply, jnp.zeros(point.shape, point.dtype))
+
+    def renewed(self, theta: PyTree, search: NeighborSearch) -> AbstractShape:
+        """As of any shape; with `onto` points are also spread evenly again."""
+        reference, base = self.onto, self.base
+        if reference is None or isinstance(base, AbstractShape):
+            return super().renewed(theta, search)
+        surface, place = unchecked_surface(self, theta), geometry(base)
+        program, dtype = self._program(theta, place[0]), place[0].dtype
+
+        def onto(x):
+            """Where the map comes nearest to x, by Newton's method on the reference."""
+            nonlocal place
+            there, x = place, jnp.asarray(x, dtype)
+            for _ in range(_PULLS):
+                points, normals = reference(_pulled(program, *there, x))
+                there = jnp.asarray(points, dtype), jnp.asarray(normals, dtype)
+            images, normals, _ = _mapped(program, *there)
+            good = jnp.all(jnp.isfinite(images) & jnp.isfinite(normals), axis=1)[:, None]
+            place = jnp.where(good, there[0], place[0]), jnp.where(good, there[1], place[1])
+            return images, normals
+
+        found = surface.moved(*spread_evenly(surface, onto), search=search)
+        cloud = eqx.tree_at(lambda c: (c.points, c.normals), base.cloud, place)
+        lists = (base.neighbors, base.method, base.border)
+        anew = with_lists(Discretization(cloud, *lists), found)
+        return eqx.tree_at(lambda s: s.base, self, anew)
+
+
+# Newton steps back to the reference: points move by a fifth of the spacing at a time.
+_PULLS = 3
 
 
 @eqx.filter_jit
-def _mapped(f: Traced, points, tangents):
+def _mapped(f: Traced, points, normals):
     """Images of points, unit normals there, and how f stretches areas."""
+    images, moved = _moved(f, points, frames_of(normals)[:, :-1])
+    normals = crossed(moved)
+    area = jnp.sqrt(jnp.sum(normals**2, axis=1))
+    return images, normals / area[:, None], area
+
+
+@eqx.filter_jit
+def _pulled(f: Traced, points, normals, wanted):
+    """Points whose images are nearer to those wanted, by a step along the tangents."""
+    tangents = frames_of(normals)[:, :-1]
+    images, moved = _moved(f, points, tangents)
+    metric = jnp.einsum("nad,nbd->nab", moved, moved)
+    along = jnp.einsum("nad,nd->na", moved, wanted - images)
+    step = jnp.linalg.solve(metric, along[..., None])[..., 0]
+    return points + jnp.einsum("na,nad->nd", step, tangents)
+
+
+def _moved(f, points, tangents):
+    """Images of points and of tangents there."""
 
     def single(x, tangents):
         images, moved = jax.vmap(lambda t: jax.jvp(f, (x,), (t,)))(tangents)
         return images[0], moved
 
-    images, moved = jax.vmap(single)(points, tangents)
-    normals = crossed(moved)
-    area = jnp.sqrt(jnp.sum(normals**2, axis=1))
-    return images, normals / area[:, None], area
+    return jax.vmap(single)(points, tangents)
 
 
 class NormalShape(AbstractShape):
@@ -263,6 +329,18 @@ def _followed(shape: AbstractShape, change: Callable) -> AbstractShape:
 
 def geometry(surface: Discretization) -> tuple[Array, Array]:
     return surface.cloud.points, surface.cloud.normals
+
+
+def spread_evenly(surface: Discretization, onto: Callable) -> tuple[Array, Array]:
+    """Points and normals of a surface pushed apart, and put back `onto` it."""
+    cloud = surface.cloud
+    spacing = ideal_spacing(float(jnp.sum(surface.areas)), cloud.n, dim=cloud.dim)
+    points, normals = relax(np.asarray(cloud.points), onto, spacing=spacing, steps=_SPREAD)
+    return jnp.asarray(points, cloud.points.dtype), jnp.asarray(normals, cloud.points.dtype)
+
+
+# Steps that spread points which the last have left nearly even.
+_SPREAD = 10
 
 
 def with_lists(surface: Discretization, found: Discretization) -> Discretization:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .monomials import differentiation, monomials_by_degree, polynomial_count
+from .plane import Neighborhood, TangentPlane
 
 
 class Graph(eqx.Module):
@@ -22,6 +23,12 @@ class Graph(eqx.Module):
     coefficients: Float[Array, "m *p"]
     degree: int = eqx.field(static=True)
     dim: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, around: Neighborhood, degree: int) -> tuple[TangentPlane, Graph]:
+        """The tangent plane of a neighbourhood, and the surface over it."""
+        plane = TangentPlane.of(around, degree)
+        return plane, cls(plane.surface(1, degree)[0], degree, len(plane.points))
 
     @property
     def slopes(self) -> list[list[Array]]:

@@ -42,7 +42,8 @@ def optimize_shape(
     gradient has fallen tenfold, or every 20 steps, and a penalty that grows fourfold where that
     gradient has fallen and the violation has not. Steps after which the surface folds or, without
     a border, passes through itself, or a number is not finite, are halved. Neighbours are found
-    anew once the surface was sheared or stretched by about an eighth (`AbstractShape.renewed`),
+    anew once the surface was sheared or stretched by about an eighth (`AbstractShape.renewed`), and
+    points of level sets, and of maps with `onto`, spread evenly again;
     points are chosen anew where a level set in `bounds` has other parts (`js.LevelSetShape`); the
     optimiser keeps its state, and nothing is compiled again. Only L-BFGS begins again where the
     points that are chosen cannot follow back to the step before.

@@ -146,7 +146,8 @@ TESTED = {
         "bad input": "malformed",
     },
     "MappedShape": {
-        "value": _SHAPE + "test_points_and_normals_are_those_of_the_shape",
+        "value": _SHAPE + "test_points_and_normals_are_those_of_the_shape, "
+        "test_optimize.py::test_stars_and_maps_are_spread_evenly_again",
         "gradient": {"theta": _SHAPE + "test_derivatives_are_differences_of_shapes_made_anew"},
         "jit": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
         "vmap": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
@@ -162,7 +163,8 @@ TESTED = {
         "bad input": "malformed",
     },
     "star_shape": {
-        "value": _SHAPE + "test_derivatives_are_differences_of_shapes_made_anew",
+        "value": _SHAPE + "test_derivatives_are_differences_of_shapes_made_anew, "
+        "test_optimize.py::test_points_are_spread_on_the_way_and_no_step_compiles",
         "gradient": {"theta": _SHAPE + "test_derivatives_are_differences_of_shapes_made_anew"},
         "jit": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",
         "vmap": _SHAPE + "test_compiled_once_mapped_and_on_the_same_lists",

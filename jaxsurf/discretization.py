@@ -133,7 +133,7 @@ class Discretization(eqx.Module):
     def _is_fitted_once(self) -> bool:
         """Whether areas take the surface from where the operators are built.
 
-        In compiled code only, where what nobody asks for is left out.
+        In compiled code, where what nobody asks for is left out (and under a bare `vmap`).
         """
         compiled = not is_concrete(without_derivatives(self.cloud))
         return compiled and quadrature.shares_fits(self.neighbors, self.method)

@@ -473,3 +473,17 @@ def test_single_precision():
     np.testing.assert_allclose(found, exact.interpolate(u, wanted), atol=1e-5)
     moved = surface.moved(2 * single.points)
     assert moved.cloud.normals.dtype == jnp.float32 and not moved.code.any()
+
+
+def test_areas_of_a_method_without_laplacian():
+    """Degree 1 has gradients and areas, compiled and not."""
+    cloud = js.sphere(200)
+    lists = js.find_neighbors(cloud, 20)
+
+    def area(x):
+        cloud = js.PointCloud(x, x)
+        return js.discretize(cloud, lists, method=js.GFDM(degree=1)).areas.sum()
+
+    x = cloud.points
+    np.testing.assert_allclose(jax.jit(area)(x), area(x), rtol=1e-12)
+    assert js.discretize(cloud, lists, method=js.GFDM(degree=1)).gradient.weights.shape[0] == 20

@@ -105,3 +105,14 @@ def test_eigenvalues_mapped_and_in_single_precision():
     assert found.dtype == jnp.float32
     wanted = np.array([0, 1, 1, 4, 4]) / np.array([[1], [4]])
     np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-5)
+
+
+def test_methods_whose_gradient_is_too_coarse_keep_the_values_of_the_laplacian():
+    """With degree 2 Ritz values of the third harmonics are five times as far off."""
+    surface = js.discretize(js.sphere(400), method=js.GFDM(degree=2))
+    x, values = surface.cloud.points, js.eigenvalues(surface, 9)
+    np.testing.assert_array_equal(values, js.eigenmodes(surface.laplacian, 9).values)
+    load = x[:, 0] * x[:, 1]
+    u = js.solve(-surface.laplacian + 1.0, load, rtol=1e-10).value
+    work = js.compliance(surface, load, screening=1.0)
+    np.testing.assert_allclose(work, surface.inner(load, u), rtol=1e-8)

@@ -222,3 +222,20 @@ def test_gradient_through_estimated_normals():
         return smooth(js.laplace_beltrami(cloud, neighbors, method=js.GFDM(degree=4))(FIELD))
 
     check_derivative(total, CLOUD.points, step=1e-5)
+
+
+def test_second_derivatives_in_the_geometry():
+    """By Euler's identity: a step along the axes only scales."""
+    surface = js.discretize(js.sphere(200), method=js.GFDM(degree=2))
+    x, normals = surface.cloud.points, surface.cloud.normals
+    z = x[:, 2]
+
+    def f(axes):
+        scaled = normals / axes
+        scaled = scaled / jnp.linalg.norm(scaled, axis=1, keepdims=True)
+        return z @ surface.moved(axes * x, scaled).laplacian(z**2)
+
+    axes = jnp.array([1.0, 1.1, 1.25])
+    slope, turned = jax.jvp(jax.grad(f), (axes,), (axes,))
+    # The Laplacian is of degree -2, so its derivative of degree -3.
+    np.testing.assert_allclose(turned, -3 * slope, rtol=1e-9, atol=1e-12)

@@ -362,6 +362,23 @@ def test_stars_and_maps_are_spread_evenly_again():
         assert not after.code.any()
 
 
+@pytest.mark.parametrize(
+    "onto, error, words",
+    [
+        (lambda x: x, TypeError, ("onto returns", "points and normals")),
+        (lambda x: (x[1:], x[1:]), ValueError, ("onto: points", "(199, 3)", "(200, 3)")),
+        (lambda x: (x, 3 * x), ValueError, ("onto: normal 0", "length 3")),
+        (lambda x: (x, -x), ValueError, ("onto: normal 0", "cosine -1")),
+        (lambda x: (x * jnp.nan, x), ValueError, ("onto: points", "point 0")),
+    ],
+)
+def test_what_is_no_projection_is_named(onto, error, words):
+    shape, axes = js.MappedShape(scaled, ball(), onto), jnp.array([1.2, 1.0, 1.0])
+    with pytest.raises(error) as told:
+        shape.renewed(axes, shape(axes).search())
+    assert all(word in str(told.value) for word in words), told.value
+
+
 def test_points_are_spread_on_the_way_and_no_step_compiles():
     """From the ball to an egg; the optimiser keeps its state, and nothing is compiled again."""
     lobes = BALL.at[6].set(1.0)

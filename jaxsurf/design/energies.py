@@ -4,6 +4,8 @@ Where an energy is stationary, an error of the field counts with its square only
 computed from the energy of the field that the Laplacian gives, and most of the error of the
 Laplacian is gone; what remains is that of the integrals and of the gradient (as in Pierce and
 Giles, SIAM Review 42, 247-264, 2000, where residuals are weighted with the adjoint solution).
+Polynomials of degree 2 have gradients that are worse than their Laplacian: those methods, and
+their like, keep what the Laplacian gives.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from jaxtyping import Array, Float
 from ..arguments import as_float, finite, real, switched_off
 from ..discretization import Discretization
 from ..failures import needs_values
-from ..solve.eigen import lowest_space
+from ..solve.eigen import eigenmodes, lowest_space
 from ..solve.steady import solve
 from .functionals import closed
 
@@ -29,7 +31,8 @@ def eigenvalues(surface: Discretization, k: int, *, degenerate: float = 1e-3) ->
     r"""The lowest k eigenvalues of $-\Delta_S$: Ritz values of the modes of the Laplacian.
 
     Those of the matrices $\int_S \nabla f_i \cdot \nabla f_j\,dS$ and $\int_S f_i f_j\,dS$, with
-    $f_i$ from `js.eigenmodes(surface.laplacian, k)` and with all modes in the group of the last.
+    $f_i$ from `js.eigenmodes(surface.laplacian, k)` and with all modes in the group of the last. Of
+    methods of degree (or order) 2 or less, the values of `js.eigenmodes` themselves.
 
     Args:
         surface: from `js.discretize`, closed.
@@ -37,7 +40,8 @@ def eigenvalues(surface: Discretization, k: int, *, degenerate: float = 1e-3) ->
         degenerate: relative distance of neighbouring values within a group.
 
     Returns:
-        Values, ascending, `(k,)`, in 1/length²; real, and not below zero where areas are positive.
+        Values, ascending, `(k,)`, in 1/length²; Ritz values are not below zero where areas are
+        positive.
 
     Accuracy: the square of the error of the modes, and the errors of areas and gradient: with
     `js.GFDM(degree=4)` some twenty times below those of `js.eigenmodes` on 2,000 points of a torus
@@ -56,6 +60,8 @@ def eigenvalues(surface: Discretization, k: int, *, degenerate: float = 1e-3) ->
         True
     """
     closed(surface)
+    if not _serves(surface):
+        return eigenmodes(surface.laplacian, k, degenerate=degenerate).values
     functions = lowest_space(surface.laplacian, k, degenerate)
     return _ritz(functions, surface.gradient(functions), surface.areas)[:k]
 
@@ -70,12 +76,14 @@ def compliance(
         f: load, `(n,)`.
         screening: $\kappa \ge 0$ in 1/length², not traced; without it f stands for f less its mean.
 
-    Computed as $\int_S (2 f u - |\nabla u|^2 - \kappa u^2)\,dS$, of which it is the largest value.
+    Computed as $\int_S (2 f u - |\nabla u|^2 - \kappa u^2)\,dS$, of which it is the largest value;
+    not so with methods of degree (or order) 2 or less.
 
     Accuracy: the square of the error of u, and the errors of areas and gradient: with
     `js.GFDM(degree=4)` some twenty times below that of $\int_S f u\,dS$ on 2,000 points of a torus
     (`tests/test_energies.py`); in float32 as `volume` (`tests/test_functionals.py`).
-    Differentiable: forward and reverse, in points, normals and f, by the implicit function theorem.
+    Differentiable: forward and reverse, in points, normals and f, by the implicit function theorem;
+        once in points and normals, as `areas`.
     Raises:
         TypeError: what is no discretisation, a load or a screening that is not made of numbers.
         ValueError: a load of another shape, a negative or traced screening, a surface with a border
@@ -99,7 +107,14 @@ def compliance(
     operator = -surface.laplacian if free else -surface.laplacian + screening
     rtol = max(_SOLVE, surface.n) * float(jnp.finfo(f.dtype).eps)
     u = solve(operator, f, mean_zero=free, project=free, rtol=rtol).value
+    if not _serves(surface):
+        return surface.inner(f, u)
     return _largest(f, screening, u, surface.gradient(u), surface.areas)
+
+
+def _serves(surface: Discretization) -> bool:
+    """Whether the gradient is accurate enough."""
+    return surface.method.polynomial_degree > 2
 
 
 @jax.jit

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PyTree
 from ..arguments import as_float, differentiable, finite, instance, pair, switched_off
 from ..compiling import sized_jit
 from ..discretization import Discretization
-from ..failures import check, marking, not_positive
+from ..failures import check, marking, not_positive, raise_at
 from ..frames import frames_of
 from ..functions import Traced, canonical
 from ..motion import crossed
@@ -100,9 +100,10 @@ class MappedShape(AbstractShape):
     Args:
         f: takes one point `(d,)` and parameters, any pytree; returns a point.
         base: what it is applied to.
-        onto: takes points `(n, d)` next to the reference to it; returns points and unit normals.
-            With it `renewed` spreads points evenly over the surface again, by moving those of the
-            reference. Then no number of an objective may belong to a point, as a load given by an
+        onto: takes points `(n, d)` next to the reference to it; returns points and unit normals on
+            the side where those of the reference are. With it `renewed` spreads points evenly over
+            the surface again, by moving those of the reference (of a base that is a shape it does
+            not). Then no number of an objective may belong to a point, as a load given by an
             array, or a point by its index, would.
 
     Differentiable: forward and reverse in theta, for fixed neighbours.
@@ -165,6 +166,7 @@ class MappedShape(AbstractShape):
         if reference is None or isinstance(base, AbstractShape):
             return super().renewed(theta, search)
         surface, place = unchecked_surface(self, theta), geometry(base)
+        _check_onto(reference(place[0]), *place)
         program, dtype = self._program(theta, place[0]), place[0].dtype
 
         def onto(x):
@@ -186,6 +188,20 @@ class MappedShape(AbstractShape):
         return eqx.tree_at(lambda s: s.base, self, anew)
 
 
+def _check_onto(found, points, normals) -> None:
+    """Refuse what is no projection to the side that a reference has."""
+    if not (isinstance(found, (tuple, list)) and len(found) == 2):
+        raise TypeError(f"onto returns a {type(found).__name__}, expected points and normals")
+    images, turned = (as_float(a, f"onto: {b}", points.shape) for a, b in zip(found, _PARTS))
+    finite(images, "onto: points")
+    length = jnp.linalg.norm(turned, axis=1)
+    raise_at(abs(length - 1) > 1e-3, "onto: normal {i} has length {v:.3g}, expected 1", length)
+    cosine = jnp.sum(turned * normals, axis=1)
+    text = "onto: normal {i} has the cosine {v:.3g} with that of the reference, expected above 0"
+    raise_at(~(cosine > 0), text, cosine)
+
+
+_PARTS = "points", "normals"
 # Newton steps back to the reference: points move by a fifth of the spacing at a time.
 _PULLS = 3
 

@@ -66,24 +66,21 @@ def support(
 
 
 def _soft_radius(r2, mask, target, dim):
-    frozen = jax.lax.stop_gradient(r2)
-    mask = mask.at[0].set(True)  # the point itself, also in rows that are switched off
+    # The point itself counts, also in rows that are switched off.
+    return jnp.exp(_log_radius(r2, mask.at[0].set(True), target))
 
-    def count(r2, t):
-        s = jnp.minimum(r2 * jnp.exp(-2 * t), 1)
-        return jnp.sum(jnp.where(mask, (1 - s) ** 3, 0), axis=0)
 
-    def slope(t):
-        s = jnp.minimum(frozen * jnp.exp(-2 * t), 1)
-        return jnp.sum(jnp.where(mask, 6 * s * (1 - s) ** 2, 0), axis=0)
+@jax.custom_jvp
+def _log_radius(r2, mask, target):
+    """Where the weights `_counted` add up to the target; derivatives, of any order, in r2."""
 
     def newton(state):
         # In an even set log(count) is a straight line in t = log(radius), nearly; where a step
         # leaves the bracket, it is halved instead.
         low, high, t, _, steps = state
-        value = count(frozen, t)
+        value, slope = _counted(r2, mask, t)
         low, high = jnp.where(value < target, t, low), jnp.where(value < target, high, t)
-        step = t + jnp.log(target / value) * value / jnp.maximum(slope(t), 1e-3 * value)
+        step = t + jnp.log(target / value) * value / jnp.maximum(slope, 1e-3 * value)
         inside = (step >= low) & (step <= high)
         new = jnp.where(inside, step, (low + high) / 2)
         return low, high, new, jnp.max(jnp.abs(new - t)), steps + 1
@@ -94,12 +91,31 @@ def _soft_radius(r2, mask, target, dim):
 
     # A disc that is filled evenly out to the radius R has a mean r^2 of R^2 / 2, a ball of any
     # dimension about that; the share of the list that is wanted takes part of it.
-    mean = jnp.sum(jnp.where(mask, frozen, 0), axis=0) / jnp.sum(mask, axis=0)
+    mean = jnp.sum(jnp.where(mask, r2, 0), axis=0) / jnp.sum(mask, axis=0)
     start = 0.5 * jnp.log(jnp.where(mean > 0, 2 * _SHARE * mean, 1))
     infinite = jnp.asarray(jnp.inf, r2.dtype)
     t = jax.lax.while_loop(moving, newton, (start - 5, start + 5, start, infinite, 0))[2]
-    # One more step, the only one that is differentiated: the implicit function theorem.
-    return jnp.exp(t + (target - count(r2, t)) / jnp.maximum(slope(t), 1e-3))
+    value, slope = _counted(r2, mask, t)
+    return t + (target - value) / jnp.maximum(slope, 1e-3)
+
+
+@_log_radius.defjvp
+def _log_radius_jvp(primals, tangents):
+    # The implicit function theorem; the target is a number of points.
+    r2, mask, target = primals
+    t = _log_radius(r2, mask, target)
+    _, slope = _counted(r2, mask, t)
+    unit = jnp.exp(-2 * t)
+    s = jnp.minimum(r2 * unit, 1)
+    lost = jnp.sum(jnp.where(mask, 3 * (1 - s) ** 2 * tangents[0], 0), axis=0) * unit
+    return t, lost / jnp.maximum(slope, 1e-3)
+
+
+def _counted(r2, mask, t):
+    """The weights $(1 - s)^3$ of all points, $s = r^2 / e^{2t}$, and their derivative in t."""
+    s = jnp.minimum(r2 * jnp.exp(-2 * t), 1)
+    count = jnp.sum(jnp.where(mask, (1 - s) ** 3, 0), axis=0)
+    return count, jnp.sum(jnp.where(mask, 6 * s * (1 - s) ** 2, 0), axis=0)
 
 
 def enclosing(r2: Float[Array, "k *p"], mask: Bool[Array, "k *p"]) -> Float[Array, "*p"]:

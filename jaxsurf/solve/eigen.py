@@ -86,7 +86,7 @@ def eigenmodes(
 
     Accuracy: that of the operator: with n = 10,000 and order 4 the first 24 non-zero values
     within 1e-5 on the unit sphere (`tests/test_eigen.py`); those of `js.eigenvalues` are more
-    accurate. In float32 values are within 1e-3 on 500
+    accurate from degree 3 on. In float32 values are within 1e-3 on 500
     points (`tests/test_eigen.py`), their gradients in the points within 1 %
     (`tests/test_forms.py`).
     Differentiable: once, forward and reverse, in the weights of the operator (so in points and

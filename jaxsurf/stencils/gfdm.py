@@ -65,7 +65,8 @@ class GFDM(AbstractMethod):
     # Columns a power of two apart share lines of a cache: at 256 derivatives took twice as long.
     batch_size = 100
     polynomial_degree = property(lambda self: max(self.degree, 2))
-    shares_moments = True
+    # Of degree 1 there is no Laplacian that a gradient could come with.
+    shares_moments = property(lambda self: self.degree > 1)
 
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
         plane = TangentPlane.of(neighborhood, self.degree, width=self.width, support=self.support)

@@ -85,6 +85,24 @@ def test_values_and_shape_derivatives_on_the_torus():
     assert (errors(plain, 2_000)[0] > 10 * fine[0]).all()
 
 
+def test_derivatives_in_the_geometry():
+    """On an ellipsoid whose axes change: nothing of first order is left."""
+    surface = js.discretize(js.sphere(300), method=METHOD)
+    shape = js.MappedShape(lambda x, axes: axes * x, surface)
+    load = jnp.exp(surface.cloud.points[:, 0])
+    functionals = {
+        "single values": lambda s: js.eigenvalues(s, 4) @ jnp.array([0.0, 1.0, -2.0, 0.5]),
+        "free": lambda s: js.compliance(s, load),
+        "screened": lambda s: js.compliance(s, load, screening=2.0),
+    }
+    axes, direction = jnp.array([1.0, 0.9, 0.8]), jnp.array([0.3, -0.2, 0.4])
+    steps = jnp.array([1e-3, 5e-4, 2.5e-4])
+    for name, f in functionals.items():
+        compiled = jax.jit(lambda axes, f=f: f(shape(axes)))
+        found = js.taylor_remainders(compiled, axes, direction, steps=steps)
+        assert abs(found.slope - 2) < 0.02, (name, found)
+
+
 def test_ritz_values_of_a_group_that_k_cuts_off():
     """The whole group counts, and so nothing depends on which of its functions come first."""
     surface = js.discretize(js.sphere(400), method=METHOD)

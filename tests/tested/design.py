@@ -72,7 +72,7 @@ TESTED = {
     "eigenvalues": {
         "value": _ENERGY + "test_values_and_shape_derivatives_on_the_torus, "
         "test_energies.py::test_ritz_values_of_a_group_that_k_cuts_off",
-        "gradient": {"points, normals": _FUN + "test_derivatives_of_what_the_surface_does"},
+        "gradient": {"points, normals": _ENERGY + "test_derivatives_in_the_geometry"},
         "jit": _ENERGY + "test_eigenvalues_mapped_and_in_single_precision",
         "vmap": _ENERGY + "test_eigenvalues_mapped_and_in_single_precision",
         "float32": _ENERGY + "test_eigenvalues_mapped_and_in_single_precision",

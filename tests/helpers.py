@@ -107,6 +107,16 @@ def check_derivatives(f, *xs, seed=0, step=1e-5, rtol=1e-6, compiled=True):
         np.testing.assert_allclose(forward, expected, rtol=rtol)
 
 
+def check_remainders(functionals, surface_of):
+    """Of functions of a surface, by name, on an ellipsoid whose axes change: second order alone."""
+    axes, direction = jnp.array([1.0, 0.9, 0.8]), jnp.array([0.3, -0.2, 0.4])
+    steps = jnp.array([1e-3, 5e-4, 2.5e-4])
+    for name, f in functionals.items():
+        compiled = jax.jit(lambda axes, f=f: f(surface_of(axes)))
+        found = js.taylor_remainders(compiled, axes, direction, steps=steps)
+        assert abs(found.slope - 2) < 0.02, (name, found)
+
+
 def jittered_sphere(n, seed=0, fraction=0.25) -> js.PointCloud:
     """Fibonacci points, each moved within a ball of a fraction of the spacing."""
     points = np.asarray(js.sphere(n).points)

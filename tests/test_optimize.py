@@ -342,7 +342,7 @@ def test_stars_and_maps_are_spread_evenly_again():
         x = x / radius(x, axis=1, keepdims=True)
         return x, x
 
-    lobes = jnp.zeros(16).at[0].set(np.sqrt(4 * np.pi)).at[6].set(1.0)
+    lobes = BALL.at[6].set(1.0)
     star = js.star_shape(ball(), 3, even=True)
     ellipsoid = js.MappedShape(lambda x, axes: axes * x, ball(), onto)
     for shape, theta in ((star, lobes), (ellipsoid, axes)):

@@ -71,13 +71,13 @@ def compliance(
 ) -> Float[Array, ""]:
     r"""$\int_S f u\,dS$ with $-\Delta u + \kappa u = f$: how far a load f moves where it acts.
 
+    Computed as $\int_S (2 f u - |\nabla u|^2 - \kappa u^2)\,dS$, of which it is the largest value;
+    not so with methods of degree (or order) 2 or less.
+
     Args:
         surface: from `js.discretize`, closed.
         f: load, `(n,)`.
         screening: $\kappa \ge 0$ in 1/length², not traced; without it f stands for f less its mean.
-
-    Computed as $\int_S (2 f u - |\nabla u|^2 - \kappa u^2)\,dS$, of which it is the largest value;
-    not so with methods of degree (or order) 2 or less.
 
     Accuracy: the square of the error of u, and the errors of areas and gradient: with
     `js.GFDM(degree=4)` some twenty times below that of $\int_S f u\,dS$ on 2,000 points of a torus

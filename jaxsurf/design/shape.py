@@ -192,7 +192,8 @@ def _check_onto(found, points, normals) -> None:
     """Refuse what is no projection to the side that a reference has."""
     if not (isinstance(found, (tuple, list)) and len(found) == 2):
         raise TypeError(f"onto returns a {type(found).__name__}, expected points and normals")
-    images, turned = (as_float(a, f"onto: {b}", points.shape) for a, b in zip(found, _PARTS))
+    images = as_float(found[0], "onto: points", points.shape)
+    turned = as_float(found[1], "onto: normals", points.shape)
     finite(images, "onto: points")
     length = jnp.linalg.norm(turned, axis=1)
     raise_at(abs(length - 1) > 1e-3, "onto: normal {i} has length {v:.3g}, expected 1", length)
@@ -201,7 +202,6 @@ def _check_onto(found, points, normals) -> None:
     raise_at(~(cosine > 0), text, cosine)
 
 
-_PARTS = "points", "normals"
 # Newton steps back to the reference: points move by a fifth of the spacing at a time.
 _PULLS = 3
 

@@ -9,7 +9,7 @@ import optax
 import pytest
 
 import jaxsurf as js
-from jaxsurf.design.crossing import crosses
+from jaxsurf.design.crossing import crosses, pierces
 from jaxsurf.design.shape import unchecked_surface
 
 pytestmark = pytest.mark.slow
@@ -95,3 +95,54 @@ def test_a_start_that_crosses_is_refused():
         js.optimize_shape(
             lambda s: jnp.mean(s.cloud.points**2), shape, 0.7, optimizer=optax.sgd(0.1)
         )
+
+
+@functools.cache
+def sheet():
+    """A long strip with a border, along z."""
+    side = np.linspace(-0.5, 0.5, 11)
+    x, z = np.meshgrid(side, np.linspace(-3, 3, 61), indexing="ij")
+    inner = np.zeros(x.shape, bool)
+    inner[1:-1, 1:-1] = True
+    shake = np.random.default_rng(0).uniform(-0.02, 0.02, (2, *x.shape)) * inner
+    points = np.stack([0 * x, x + shake[0], z + shake[1]], axis=-1).reshape(-1, 3)
+    normals = np.broadcast_to([1.0, 0.0, 0.0], points.shape)
+    cloud = js.PointCloud(points, normals, boundary=~inner.ravel())
+    return js.discretize(cloud, method=METHOD)
+
+
+def looped(x, turn):
+    """The middle half along an arc, the ends straight on: past half a turn they draw nearer."""
+    radius = 3 / turn
+    along = jnp.clip(x[2], -1.5, 1.5)
+    angle, on = along / radius, x[2] - along
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return jnp.array([radius * cos - on * sin, x[1], radius * sin + on * cos])
+
+
+def rolled(x, turn):
+    """Along an arc: after a full turn the two ends meet."""
+    radius = 6 / turn
+    return jnp.array([radius * jnp.cos(x[2] / radius), x[1], radius * jnp.sin(x[2] / radius)])
+
+
+def test_borders_may_lie_anywhere_and_what_they_bound_cross():
+    def pierced(f, theta):
+        cloud = unchecked_surface(js.MappedShape(f, sheet()), jnp.array(theta)).cloud
+        return bool(jax.jit(pierces)(cloud, sheet().neighbors))
+
+    # The ends meet at 4.07; the spacing is 0.1.
+    for turn, found in ((0.1, False), (3.5, False), (4.0, False), (4.3, True), (5.5, True)):
+        assert pierced(looped, turn) == found, turn
+    # Gaps of 1.5 to 0.05, side by side.
+    for gap in (1.5, 0.5, 0.2, 0.1, 0.05):
+        assert not pierced(rolled, 2 * np.pi * (1 - gap / 6)), gap
+
+
+def test_steps_that_take_a_bordered_surface_through_itself_are_halved():
+    gap = lambda s: s.cloud.points[60, 2] - s.cloud.points[0, 2]
+    with pytest.raises(js.OptimizationError, match="passes through itself: the last good") as error:
+        js.optimize_shape(
+            gap, js.MappedShape(looped, sheet()), 3.0, optimizer=optax.sgd(0.1), steps=60
+        )
+    assert 3.5 < float(error.value.solution.theta) < 4.2

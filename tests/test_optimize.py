@@ -158,12 +158,28 @@ def test_inequalities_hold_and_press():
     assert float(found.multipliers["far"]) == 0
 
 
-def test_constraints_that_contradict_each_other_are_told():
+@pytest.mark.parametrize("optimizer, steps", [(LBFGS, 300), (ADAM, 60)])
+def test_constraints_that_contradict_each_other_are_told(optimizer, steps):
     shape = js.MappedShape(scaled, ball())
     both = {"one": lambda surface: size(surface) - 1, "two": lambda surface: size(surface) - 2}
-    with pytest.raises(js.OptimizationError, match="may contradict each other") as e:
-        js.optimize_shape(size, shape, jnp.ones(3), optimizer=LBFGS, equalities=both, steps=300)
+    run = lambda **asked: js.optimize_shape(
+        size, shape, 1.2 * jnp.ones(3), optimizer=optimizer, steps=steps, **asked
+    )
+    with pytest.raises(js.OptimizationError, match="they contradict each other") as e:
+        run(equalities=both)
     assert 1 < float(size(e.value.solution.surface)) < 2
+    with pytest.raises(js.OptimizationError, match="or what the shape can do"):
+        run(inequalities={"below nothing": lambda surface: size(surface) + 0.1})
+
+
+def test_constraints_that_were_not_met_in_time_do_not_contradict():
+    """So few and short steps that the violation stays, for what one step of another would meet."""
+    shape = js.MappedShape(scaled, ball())
+    far = {"far": lambda surface: size(surface) - 2}
+    found = js.optimize_shape(
+        size, shape, jnp.ones(3), optimizer=optax.adam(1e-5), equalities=far, steps=40
+    )
+    assert "all 40 steps used, and constraints are off by" in found.stopped
 
 
 def test_a_run_that_goes_on_from_its_file_ends_in_the_same_bits(tmp_path):

@@ -17,7 +17,7 @@ from ..discretization import Discretization
 from ..failures import marking
 from ..functions import Traced, canonical
 from ..motion import judged, unreached
-from .crossing import crosses
+from .crossing import crosses, pierces
 from .shape import AbstractShape
 
 # Lists are found anew once points outside may come as near as this share of the farthest in them.
@@ -111,8 +111,8 @@ def _judged(surface: Discretization) -> tuple[Array, Array]:
     fixed = jax.lax.stop_gradient(surface)
     cloud, neighbors, found_at = fixed.cloud, fixed.neighbors, fixed.found_at
     code = jnp.max(judged(cloud, neighbors, jnp.zeros(cloud.n, cloud.points.dtype)))
-    if fixed.border is None:
-        code = jnp.where((code == 0) & crosses(cloud, neighbors), CROSSED, code)
+    crossed = crosses if fixed.border is None else pierces
+    code = jnp.where((code == 0) & crossed(cloud, neighbors), CROSSED, code)
     if found_at is None:
         return code, jnp.zeros((), bool)
     far = lambda *share: jnp.any(unreached(found_at, cloud.points, neighbors, *share))

@@ -36,9 +36,11 @@ from .shape import AbstractShape, unchecked_surface, with_wear
 _HALVINGS = 12
 # Forces are corrected after so many steps, or when the gradient has fallen to a share of its first.
 _INNER, _GOAL = 20, 0.1
-# A violation that does not fall to this share makes the penalty grow by that factor; one that
-# stays above the last share so many times in a row cannot be mended.
-_FALLS, _GROWTH, _STAYS, _STALLS = 0.25, 4.0, 0.9, 8
+# A violation that does not fall to this share makes the penalty grow by that factor.
+_FALLS, _GROWTH = 0.25, 4.0
+# One that stays above this share, so many times in a row or at the end, is minimised alone, in so
+# many steps: if it stays then too, constraints contradict each other.
+_STAYS, _STALLS, _ALONE = 0.9, 8, 50
 # An objective that has grown so much has run away.
 _RUN_AWAY = 1e3
 
@@ -71,6 +73,18 @@ class _Run(NamedTuple):
     violation: Any
     stalls: Any
     history: dict[str, np.ndarray]
+
+
+class _Violation(eqx.Module):
+    r"""What constraints are off by, $\tfrac12 \sum h^2 + \tfrac12 \sum \max(0, g)^2$."""
+
+    equalities: dict[str, Callable]
+    inequalities: dict[str, Callable]
+
+    def __call__(self, surface, *args):
+        off = [h(surface, *args) for h in self.equalities.values()]
+        off += [jnp.maximum(0, g(surface, *args)) for g in self.inequalities.values()]
+        return sum(jnp.sum(x**2) for x in off) / 2
 
 
 class _Held:
@@ -149,6 +163,9 @@ class Loop(NamedTuple):
             if failed:
                 break
             stopped = self.ended(run)
+            if why := self.contradiction(shape, run, last=bool(stopped)):
+                stopped, failed = why, True
+                break
             if file is not None and (stopped or int(run.step) % file.every == 0):
                 written(file.path, file.told, run)
             if self.callback is not None and self.callback(self.found(run, shape, stopped)):
@@ -235,12 +252,6 @@ class Loop(NamedTuple):
             why = "no step along the search lowers the objective"
             if ills:
                 why += f", and farther along it {ills[-1]}: the last good shape is kept"
-        if int(run.stalls) >= _STALLS:
-            why = (
-                f"constraints are not met: a violation of {float(run.violation):.3g} has stayed "
-                f"while the penalty grew to {float(run.multipliers.penalty):.3g}; they may "
-                "contradict each other, or what the shape can do"
-            )
         _note(run, refused=refused, renewed=renewed, rebuilt=rebuilt)
         return run, shape, why
 
@@ -275,12 +286,38 @@ class Loop(NamedTuple):
         wrong = now > self.numbers["ctol"]
         if wrong and solved and now > _FALLS * last:
             multipliers = multipliers._replace(penalty=_GROWTH * multipliers.penalty)
-        stalls = run.stalls + solved if wrong and now > _STAYS * last else np.array(0)
+        # Under a projection they are not minimised alone.
+        counts = solved or self.project is None
+        stalls = run.stalls + counts if wrong and now > _STAYS * last else np.array(0)
         goal = np.maximum(self.numbers["rtol"], _GOAL * run.goal)
         return run._replace(
             multipliers=multipliers, violation=np.array(now), stalls=stalls, goal=goal,
             since=np.array(0),
         )  # fmt: skip
+
+    def contradiction(self, shape, run: _Run, last: bool) -> str:
+        """Whether a violation that has stayed also does where nothing else is minimised."""
+        off, ctol = float(run.values.violation), self.numbers["ctol"]
+        stalls, alone = int(run.stalls), self.project is None
+        often = stalls >= _STALLS and stalls % _STALLS == 0 and int(run.since) == 0
+        if off <= ctol or not (often or (last and stalls and alone)):
+            return ""
+        first, least = off**2, off**2
+        if alone:
+            violation = _Violation(self.equalities, self.inequalities)
+            met = lambda now: bool(now.objective <= ctol**2 / 2)
+            loop = self._replace(
+                objective=violation, equalities={}, inequalities={}, optimizer=optax.lbfgs(),
+                numbers=self.numbers | dict(steps=_ALONE), callback=met, checkpoint=None,
+            )  # fmt: skip
+            found = loop.run(shape, run.theta)[0].history["objective"]
+            first, least = float(found[0]), float(found[-1])
+        if least <= _STAYS**2 * first:
+            return ""
+        return (
+            f"constraints are not met: a violation of {off:.3g} has stayed, and is not lessened "
+            "where they alone count either; they contradict each other, or what the shape can do"
+        )
 
     def ended(self, run: _Run) -> str:
         """Why it ends here, if it does."""

@@ -13,7 +13,8 @@ from .adapt import dominance, is_better, represented, share_wanted, sizes_to_try
 from .adapt import residual_tolerance as residual_tolerance
 from .arguments import as_many, instance, whole
 from .cloud import PointCloud
-from .compiling import at_once, copying_jit, namespace, on_device, pieces_jit, sized_jit
+from .compiling import at_once, copying_jit, is_quick, namespace, on_device, pieces_jit, sized_jit
+from .cores import calls_library, divided, side_by_side
 from .failures import (
     is_concrete,
     needs_values,
@@ -159,9 +160,47 @@ def stencil_weights(
     points but a rounded number of blocks, so that clouds of other sizes share it.
     """
     rows = np.arange(cloud.n, dtype=np.int32) if rows is None else rows
-    size = whole(method.batch_size, f"batch_size of {method}", least=1)
-    blocks = blocks_of(cloud, neighbors, rows, block(size))
-    return rows_of(*_weights_of_blocks(blocks, method, target), len(rows))
+    size = block(whole(method.batch_size, f"batch_size of {method}", least=1))
+
+    def found(neighbors, rows):
+        blocks = blocks_of(cloud, neighbors, rows, size)
+        return rows_of(*_weights_of_blocks(blocks, method, target), len(rows))
+
+    if not is_concrete(cloud, neighbors, rows):
+        return found(neighbors, rows)
+    places = divided(len(rows), size, neighbors.mask.shape[1] * (2 * cloud.dim + 1))
+    if len(places) == 1:
+        return found(neighbors, rows)
+    lists = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
+    rows = np.asarray(rows)
+    parts = [(Rows(lists[0][at], lists[1][at], neighbors.radius), rows[at]) for at in places]
+    if _calls_library(cloud, parts[0], size, method, target):
+        return found(neighbors, rows)
+    return _joined(side_by_side(lambda part: found(*part), parts), len(rows))
+
+
+def _calls_library(cloud, part, size, method, target) -> bool:
+    """Whether these weights come from a program that has to run alone; so do those of no hash."""
+    kind = (method, target, cloud.dim, cloud.points.dtype, part[0].mask.shape, size, is_quick())
+    try:
+        hash(kind)
+    except TypeError:
+        return True
+    if kind not in _KINDS:
+        blocks = blocks_of(cloud, *part, size)
+        _KINDS[kind] = calls_library(_weights_of_blocks.jaxpr(blocks, method, target))
+    return _KINDS[kind]
+
+
+# What was looked at by `_calls_library`.
+_KINDS: dict[tuple, bool] = {}
+
+
+@copying_jit
+def _joined(parts, count: int):
+    """Parts side by side."""
+    xp = namespace(parts[0][0])
+    return jax.tree.map(lambda *a: xp.concatenate(a, axis=-1)[..., :count], *parts)
 
 
 @copying_jit

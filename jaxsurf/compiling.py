@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextvars
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +39,7 @@ def sized_jit(f: Callable) -> Callable:
     optimisations; so does a jaxlib that does not know the options.
     """
 
-    thorough, quick = _programs(f)
+    thorough, quick, _ = _programs(f)
 
     @functools.wraps(f)
     def call(*args):
@@ -53,8 +53,16 @@ def sized_jit(f: Callable) -> Callable:
     return call
 
 
-def _programs(f: Callable) -> tuple[Callable, Callable]:
-    """A function compiled with all optimisations and with fewer; what is no array is static."""
+class Programs(NamedTuple):
+    """A function compiled with all optimisations and with fewer, and what the first computes."""
+
+    thorough: Callable
+    quick: Callable
+    jaxpr: Callable
+
+
+def _programs(f: Callable) -> Programs:
+    """Programs of a function; what is no array is static."""
 
     def program(arrays, others, structure):
         leaves = [other if array is None else array for array, other in zip(arrays, others)]
@@ -67,42 +75,52 @@ def _programs(f: Callable) -> tuple[Callable, Callable]:
         finally:
             quickly.reset(token)
 
-    def called(compiled):
-        def call(*args):
-            leaves, structure = jax.tree.flatten(args)
-            arrays = [a if is_array(a) else None for a in leaves]
-            others = tuple(None if is_array(a) else a for a in leaves)
-            return compiled(arrays, others, structure)
+    def apart(args):
+        leaves, structure = jax.tree.flatten(args)
+        arrays = [a if is_array(a) else None for a in leaves]
+        return arrays, tuple(None if is_array(a) else a for a in leaves), structure
 
-        return call
+    def called(compiled):
+        return lambda *args: compiled(*apart(args))
 
     program.__name__ = quick_program.__name__ = f.__name__
     compiled = functools.cache(
         lambda: jax.jit(quick_program, static_argnums=(1, 2), compiler_options=_known_options())
     )
     quick = called(lambda *args: compiled()(*args))
-    return called(jax.jit(program, static_argnums=(1, 2))), quick
+    thorough = jax.jit(program, static_argnums=(1, 2))
+    traced = lambda *args: thorough.trace(*apart(args)).jaxpr.jaxpr
+    return Programs(called(thorough), quick, traced)
 
 
-def pieces_jit(f: Callable) -> Callable:
+class Pieces:
+    """A function of blocks as `pieces_jit` makes it."""
+
+    def __init__(self, f: Callable):
+        functools.update_wrapper(self, f)
+        self.programs = _programs(f)
+
+    def __call__(self, blocks, *args):
+        leaves = jax.tree.leaves((blocks, args))
+        if _takes_longer_to_compile(leaves):
+            try:
+                return _by_pieces(self.programs.quick, jax.tree.map(np.asarray, blocks), args)
+            except ValueError:  # within another program, if only with constants
+                pass
+        return self.programs.thorough(blocks, None, *args)
+
+    def jaxpr(self, blocks, *args):
+        """What it computes for large arrays."""
+        return self.programs.jaxpr(blocks, None, *args)
+
+
+def pieces_jit(f: Callable) -> Pieces:
     """`sized_jit` for a function of blocks, `f(blocks, count, ...)`, that treats one after another.
 
     Where the arrays are small it is called on pieces of so many blocks, filled up, and told how
     many count: any number of points shares one program. Else `count` is None: all.
     """
-    thorough, quick = _programs(f)
-
-    @functools.wraps(f)
-    def call(blocks, *args):
-        leaves = jax.tree.leaves((blocks, args))
-        if _takes_longer_to_compile(leaves):
-            try:
-                return _by_pieces(quick, jax.tree.map(np.asarray, blocks), args)
-            except ValueError:  # within another program, if only with constants
-                pass
-        return thorough(blocks, None, *args)
-
-    return call
+    return Pieces(f)
 
 
 def _by_pieces(program: Callable, blocks, args: tuple):

@@ -40,7 +40,9 @@ class Machine(NamedTuple):
         gathered: weights of a scalar operator below which everything is gathered at once, without
             a loop.
         unknowns: of small systems up to which straight-line code runs faster than a library.
+        columns: unknowns up to which these are factored in loops over columns.
         quick: numbers given to a program, in all its arrays, below which it is compiled quickly.
+        divides: whether programs are divided among its cores.
         sorts: whether the compiler's own sorting is faster than a network of exchanges.
     """
 
@@ -49,15 +51,33 @@ class Machine(NamedTuple):
     slots: int
     gathered: int
     unknowns: int
+    columns: int
     quick: int
+    divides: bool
     sorts: bool
 
 
 CPU = Machine(
-    points=1, pairs=1, slots=10, gathered=50_000, unknowns=15, quick=1_750_000, sorts=False
+    points=1,
+    pairs=1,
+    slots=10,
+    gathered=50_000,
+    unknowns=15,
+    columns=27,
+    quick=1_750_000,
+    divides=True,
+    sorts=False,
 )
 ACCELERATOR = Machine(
-    points=256, pairs=16, slots=1_000, gathered=1 << 40, unknowns=15, quick=0, sorts=True
+    points=256,
+    pairs=16,
+    slots=1_000,
+    gathered=1 << 40,
+    unknowns=15,
+    columns=15,
+    quick=0,
+    divides=False,
+    sorts=True,
 )
 
 

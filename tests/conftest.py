@@ -56,6 +56,7 @@ def quick_environment() -> dict[str, str]:
 # Files that test stencils in the form that runs faster, as users compile it in programs of theirs.
 THOROUGH = (
     "accuracy",
+    "cores",
     "gradients",
     "moments",
     "operators",

@@ -2,9 +2,9 @@ r"""Linear algebra of the small systems: products with a basis, and symmetric so
 
 Two forms of the same operations. In *small* ones a vector over the basis is a list of arrays, and
 sums over the neighbours are straight-line code on its entries, which a compiler makes loops over
-the points of a block. Matrices are factored in loops over columns, all points at a time. In large
-ones a vector is one array, and library calls do the work matrix by matrix; NumPy does it for its
-arrays, compiled by nobody.
+the points of a block. In large ones a vector is one array. Matrices are factored in loops over
+columns, all points at a time, up to a size; beyond it library calls do the work matrix by matrix.
+NumPy does it for its arrays, compiled by nobody.
 
 Shapes: q points of a neighbourhood, c right-hand sides, m monomials, `*p` points of a block.
 """
@@ -85,7 +85,7 @@ def factor(gram):
     scale = rsqrt(namespace(a).where(diagonal > 0, diagonal, 1))
     a = a * scale * scale[:, None]
     shift = 4 * len(a) * jnp.finfo(a.dtype).eps
-    solve_scaled, pivot = (_by_columns if small else _by_lapack)(a, shift)
+    solve_scaled, pivot = (_by_columns if small or _in_columns(a) else _by_lapack)(a, shift)
 
     def solve(b, refined=True):
         b = (jnp.stack(b) if small else b) * scale[:, None]
@@ -94,6 +94,12 @@ def factor(gram):
 
     xp = namespace(pivot)
     return solve, (xp.max(pivot, axis=0) / xp.min(pivot, axis=0)) ** 2
+
+
+def _in_columns(a) -> bool:
+    """Whether a loop over columns is faster than a library: for the points of a block, not one."""
+    loops = a.ndim > 2 and namespace(a) is jnp and not is_quick()
+    return loops and len(a) <= machine().columns
 
 
 def _by_columns(a, shift):

@@ -10,6 +10,7 @@ form of stencils that users' own programs have, and what runs on several devices
 
 import importlib.metadata
 import importlib.util
+import gc
 import os
 from pathlib import Path
 
@@ -25,6 +26,8 @@ _as_users = dict(os.environ)
 _quick = ["--xla_backend_optimization_level=1", "--xla_cpu_parallel_codegen_split_count=2"]
 if importlib.metadata.version("jaxlib").startswith("0.10."):
     _quick.append("--xla_cpu_use_fusion_emitters=false")
+# Full collections of garbage take a third of the time in which large programs are traced.
+gc.set_threshold(700, 10, 1_000)
 os.environ["XLA_FLAGS"] = " ".join([*_quick, os.environ.get("XLA_FLAGS", "")])
 _optimised_little = dict(os.environ)
 

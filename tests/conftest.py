@@ -8,9 +8,9 @@ optimised little, here and in the experiments and notebooks that tests start. Th
 form of stencils that users' own programs have, and what runs on several devices is optimised fully.
 """
 
+import gc
 import importlib.metadata
 import importlib.util
-import gc
 import os
 from pathlib import Path
 

@@ -13,7 +13,7 @@ from .adapt import dominance, is_better, represented, share_wanted, sizes_to_try
 from .adapt import residual_tolerance as residual_tolerance
 from .arguments import as_many, instance, whole
 from .cloud import PointCloud
-from .compiling import at_once, copying_jit, is_quick, namespace, on_device, pieces_jit, sized_jit
+from .compiling import Pieces, at_once, copying_jit, is_quick, namespace, on_device, sized_jit
 from .cores import calls_library, divided, side_by_side
 from .failures import (
     is_concrete,
@@ -174,26 +174,30 @@ def stencil_weights(
     lists = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
     rows = np.asarray(rows)
     parts = [(Rows(lists[0][at], lists[1][at], neighbors.radius), rows[at]) for at in places]
-    if _calls_library(cloud, parts[0], size, method, target):
+    kind = cloud.dim, lists[1].shape[1], cloud.points.dtype, is_quick()
+    if _runs_alone(method, target, kind, lambda: blocks_of(cloud, *parts[0], size)):
         return found(neighbors, rows)
     return _joined(side_by_side(lambda part: found(*part), parts), len(rows))
 
 
-def _calls_library(cloud, part, size, method, target) -> bool:
-    """Whether these weights come from a program that has to run alone; so do those of no hash."""
-    kind = (method, target, cloud.dim, cloud.points.dtype, part[0].mask.shape, size, is_quick())
+# What was looked at by `_runs_alone`.
+_KINDS: dict[tuple, bool] = {}
+
+
+def _runs_alone(method, target, kind: tuple, make_blocks) -> bool:
+    """Whether weights come from a program that calls a library; methods without a hash may.
+
+    Args:
+        kind: all else that this may hang on.
+    """
+    kind = method, target, *kind
     try:
-        hash(kind)
+        known = kind in _KINDS
     except TypeError:
         return True
-    if kind not in _KINDS:
-        blocks = blocks_of(cloud, *part, size)
-        _KINDS[kind] = calls_library(_weights_of_blocks.jaxpr(blocks, method, target))
+    if not known:
+        _KINDS[kind] = calls_library(_weights_of_blocks.jaxpr(make_blocks(), method, target))
     return _KINDS[kind]
-
-
-# What was looked at by `_calls_library`.
-_KINDS: dict[tuple, bool] = {}
 
 
 @copying_jit
@@ -222,7 +226,7 @@ def _slots_first(indices):
     return indices.T
 
 
-@pieces_jit
+@Pieces
 def _weights_of_blocks(blocks, count, method, target):
     return blockwise(lambda block: weights_by(method, neighborhood(block), target), blocks, count)
 

@@ -94,7 +94,11 @@ def _programs(f: Callable) -> Programs:
 
 
 class Pieces:
-    """A function of blocks as `pieces_jit` makes it."""
+    """`sized_jit` for a function of blocks, `f(blocks, count, ...)`, that treats one after another.
+
+    Where the arrays are small it is called on pieces of so many blocks, filled up, and told how
+    many count: any number of points shares one program. Else `count` is None: all.
+    """
 
     def __init__(self, f: Callable):
         functools.update_wrapper(self, f)
@@ -112,15 +116,6 @@ class Pieces:
     def jaxpr(self, blocks, *args):
         """What it computes for large arrays."""
         return self.programs.jaxpr(blocks, None, *args)
-
-
-def pieces_jit(f: Callable) -> Pieces:
-    """`sized_jit` for a function of blocks, `f(blocks, count, ...)`, that treats one after another.
-
-    Where the arrays are small it is called on pieces of so many blocks, filled up, and told how
-    many count: any number of points shares one program. Else `count` is None: all.
-    """
-    return Pieces(f)
 
 
 def _by_pieces(program: Callable, blocks, args: tuple):

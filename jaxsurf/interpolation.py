@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from .build import blocks_of, determined, neighborhood, rows_of
 from .cloud import PointCloud
-from .compiling import copying_jit, namespace, on_device, pieces_jit
+from .compiling import Pieces, copying_jit, namespace, on_device
 from .failures import is_concrete, refuse
 from .fits.moments import blockwise, in_blocks, moment_solve
 from .fits.monomials import monomials
@@ -105,7 +105,7 @@ def _seen_from(cloud, neighbors, points, centers):
     return lists.indices.T, lists, in_blocks((points - cloud.points[centers]).T, block(READ))
 
 
-@pieces_jit
+@Pieces
 def _of_blocks(blocks, count, degree: int):
     def weights(block):
         around, offset = neighborhood(block[0]), block[1]

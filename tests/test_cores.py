@@ -84,10 +84,25 @@ def test_methods_of_low_degree_call_no_library(divided):
     assert divided == [3, 3]
 
 
-def test_accelerators_and_few_rows_are_not_divided(monkeypatch):
+def test_few_rows_are_not_divided(monkeypatch):
+    monkeypatch.setattr(cores, "count_cores", lambda: 3)
     assert len(cores.divided(10_000, 100, 1)) == 1
-    many = cores.divided(10_000_000, 100, 1)
-    assert len(many) == cores.count_cores()
+    many = cores.divided(10_000_000, 100, 10)
+    assert len(many) == 3
     assert np.array_equal(np.unique(np.concatenate(many)), np.arange(10_000_000))
+
+
+def test_accelerators_are_not_divided(monkeypatch):
+    assert cores.count_cores() >= 1
     monkeypatch.setattr(machine, "CPU", machine.ACCELERATOR)
-    assert len(cores.divided(10_000_000, 100, 1)) == 1
+    assert cores.count_cores() == 1
+    assert len(cores.divided(10_000_000, 100, 10)) == 1
+
+
+def test_what_calls_a_library_in_space_may_not_in_the_plane(divided):
+    """The answer for one dimension is not that for another."""
+    method = js.DCPSE(order=3)
+    for cloud in (js.sphere(N), js.circle(N), js.sphere(N)):
+        near = js.find_neighbors(cloud, method.neighbor_count(cloud.dim))
+        js.laplace_beltrami(cloud, near, method=method)
+    assert divided == [3]

@@ -296,28 +296,30 @@ class Loop(NamedTuple):
         )  # fmt: skip
 
     def contradiction(self, shape, run: _Run, last: bool) -> str:
-        """Whether a violation that has stayed also does where nothing else is minimised."""
-        off, ctol = float(run.values.violation), self.numbers["ctol"]
-        stalls, alone = int(run.stalls), self.project is None
+        """What is told of a violation that has stayed and cannot be lessened, if there is one."""
+        off, stalls = float(run.values.violation), int(run.stalls)
         often = stalls >= _STALLS and stalls % _STALLS == 0 and int(run.since) == 0
-        if off <= ctol or not (often or (last and stalls and alone)):
+        if off <= self.numbers["ctol"] or not stalls or not (often or last):
             return ""
-        first, least = off**2, off**2
-        if alone:
-            violation = _Violation(self.equalities, self.inequalities)
-            met = lambda now: bool(now.objective <= ctol**2 / 2)
-            loop = self._replace(
-                objective=violation, equalities={}, inequalities={}, optimizer=optax.lbfgs(),
-                numbers=self.numbers | dict(steps=_ALONE), callback=met, checkpoint=None,
-            )  # fmt: skip
-            found = loop.run(shape, run.theta)[0].history["objective"]
-            first, least = float(found[0]), float(found[-1])
-        if least <= _STAYS**2 * first:
+        text = f"constraints are not met: a violation of {off:.3g} has stayed"
+        if self.project is None:
+            if self.is_lessened(shape, run.theta):
+                return ""
+            text += ", and is not lessened where they alone count either"
+        elif not often:
             return ""
-        return (
-            f"constraints are not met: a violation of {off:.3g} has stayed, and is not lessened "
-            "where they alone count either; they contradict each other, or what the shape can do"
-        )
+        return f"{text}; they contradict each other, or what the shape can do"
+
+    def is_lessened(self, shape, theta) -> bool:
+        """Whether constraints come nearer where they alone are minimised."""
+        met = lambda now: bool(now.objective <= self.numbers["ctol"] ** 2 / 2)
+        alone = self._replace(
+            objective=_Violation(self.equalities, self.inequalities), equalities={},
+            inequalities={}, optimizer=optax.lbfgs(), callback=met, checkpoint=None,
+            numbers=self.numbers | dict(steps=_ALONE),
+        )  # fmt: skip
+        violation = alone.run(shape, theta)[0].history["objective"]
+        return bool(violation[-1] <= _STAYS**2 * violation[0])
 
     def ended(self, run: _Run) -> str:
         """Why it ends here, if it does."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextvars
 import functools
+import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,7 +25,9 @@ else:
 # `ensure_compile_time_eval` would take apart the programs called in it as well, and compile what
 # depends on constants alone operation by operation.)
 at_once = jax.core.eval_context
-quickly = contextvars.ContextVar("quickly", default=False)
+# The environment variable is for programs that would be compiled for longer than they run.
+_as_told = os.environ.get("JAXSURF_QUICKLY", "") not in ("", "0")
+quickly = contextvars.ContextVar("quickly", default=_as_told)
 
 
 def is_quick() -> bool:

@@ -4,8 +4,9 @@ Of the cache environment variables tell, so that the commands that tests start h
 is not among them: those commands must ask for it themselves.
 
 Most of the time of a test is compilation, of programs that run for milliseconds. So they are
-optimised little, here and in the experiments and notebooks that tests start. Those still take the
-form of stencils that users' own programs have, and what runs on several devices is optimised fully.
+optimised little, here and in the experiments and notebooks that tests start, and stencils take the
+form that compiles faster. Some files test the form that users' own programs have; what runs on
+several devices is optimised fully.
 """
 
 import gc
@@ -29,7 +30,7 @@ if importlib.metadata.version("jaxlib").startswith("0.10."):
 # Full collections of garbage take a third of the time in which large programs are traced.
 gc.set_threshold(700, 10, 1_000)
 os.environ["XLA_FLAGS"] = " ".join([*_quick, os.environ.get("XLA_FLAGS", "")])
-_optimised_little = dict(os.environ)
+_optimised_little = {**os.environ, "JAXSURF_QUICKLY": "1"}
 
 import jax
 import pytest

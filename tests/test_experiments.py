@@ -25,7 +25,7 @@ from experiments.report import Row, slope, table
 ROOT = Path(__file__).resolve().parents[1]
 
 
-# All but the neural one, which fits a network first; its steps are Newton's, and converge.
+# All but the neural one, which fits a network first: it tells its slope itself.
 OBJECTIVES = [name for name in shapes.SIZES if name != "neural-bunny"]
 
 

@@ -157,9 +157,23 @@ def test_what_leaves_the_box_or_is_no_more_is_told():
     with pytest.raises(js.OptimizationError, match="12 times, and still the level set leaves") as e:
         run(lambda surface: -radius(surface), 1.0)
     assert 1.4 < float(e.value.solution.theta) < 1.5
-    with pytest.raises(js.OptimizationError, match="12 times, and still phi has no zero") as e:
+    with pytest.raises(js.OptimizationError, match="still the level set vanishes") as e:
         run(radius, 1.0)
     assert 0 < float(e.value.solution.theta) < 0.1
+
+
+@pytest.mark.parametrize("centre", [0.0, 0.013])
+def test_a_ball_vanishes_around_a_node_of_the_grid_as_elsewhere(centre):
+    """A node within it would be seen however small it is."""
+    ball = lambda x, radius: jnp.sum((x - centre) ** 2) - radius**2
+    cloud = js.sphere(200)
+    cloud = js.PointCloud(cloud.points + centre, cloud.normals)
+    surface = js.discretize(cloud, method=METHOD)
+    shape = js.LevelSetShape(ball, surface, ((-1.5,) * 3, (1.5,) * 3))
+    what = "the level set vanishes" if centre == 0 else "phi has no zero"
+    with pytest.raises(js.OptimizationError, match=f"12 times, and still {what}") as e:
+        js.optimize_shape(lambda s: s.areas.sum(), shape, 1.0, optimizer=optax.sgd(0.03), steps=60)
+    assert 0.02 < float(e.value.solution.theta) < 0.1
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,8 @@ class LevelSetShape(AbstractShape):
         TypeError: phi that is no function, a surface that is no discretisation.
         ValueError: at a theta for which points do not reach the level set, named by point; under
             `jit`, `vmap` and `grad` they are NaN, with code 1. Bounds of another dimension or that
-            are none, or for a surface with a border, a mask or a spacing of its own.
+            are none, or for a surface with a border, a mask or a spacing of its own. In
+            `js.optimize_shape` also a level set within one cell.
 
     Example:
         >>> phi = lambda x, axes: jnp.sum((x / axes) ** 2) - 1
@@ -137,6 +138,7 @@ class LevelSetShape(AbstractShape):
         points = np.asarray(unchecked_surface(self, theta).cloud.points)
         known = lambda counts: jnp.asarray([np.count_nonzero(counts), sheets.tunnels], jnp.int32)
         if np.isfinite(points).all():
+            _check_extent(np.ptp(points, axis=0), sides.size)
             counts, before = sheets.counts(points), np.asarray(self.topology)
             covered = (counts >= seen * wanted / _FEWER).all()
             if covered and not before.any():
@@ -147,6 +149,15 @@ class LevelSetShape(AbstractShape):
         topology = known(sheets.counts(np.asarray(chosen.points)))
         surface = _listed(self.surface, chosen, k, search)
         return eqx.tree_at(lambda s: (s.surface, s.topology), self, (surface, topology))
+
+
+def _check_extent(extent: np.ndarray, cell: np.ndarray) -> None:
+    """What is within one cell would be seen or not, as there is a node of the grid in it or not."""
+    if (extent < cell).all():
+        raise ValueError(
+            f"the level set vanishes: it extends over {extent.max():.2g}, less than a cell of the "
+            f"grid within the bounds, {cell.max():.2g}"
+        )
 
 
 def _listed(

@@ -3,8 +3,8 @@ r"""Linear algebra of the small systems: products with a basis, and symmetric so
 Two forms of the same operations. In *small* ones a vector over the basis is a list of arrays, and
 sums over the neighbours are straight-line code on its entries, which a compiler makes loops over
 the points of a block. In large ones a vector is one array. Matrices are factored in loops over
-columns, all points at a time, up to a size; beyond it library calls do the work matrix by matrix.
-NumPy does it for its arrays, compiled by nobody.
+columns, all points at a time; on accelerators, and where programs are to be compiled quickly,
+larger ones by library calls, matrix by matrix. NumPy does it for its arrays, compiled by nobody.
 
 Shapes: q points of a neighbourhood, c right-hand sides, m monomials, `*p` points of a block.
 """
@@ -19,6 +19,9 @@ import numpy as np
 
 from ..compiling import is_quick, namespace
 from ..machine import machine
+
+# Columns of a factor between two passes over the matrix.
+_TOGETHER = 8
 
 
 def is_small(unknowns: int) -> bool:
@@ -103,21 +106,8 @@ def _in_columns(a) -> bool:
 
 
 def _by_columns(a, shift):
-    """Cholesky's factor column by column, for all points at once.
-
-    Loops, whose bodies are short: written out, 14 unknowns take ten seconds to compile.
-    """
-    m = len(a)
-    rows = jnp.arange(m).reshape(m, *(1,) * (a.ndim - 2))
-
-    def eliminate(j, columns):
-        # Columns that are not there yet are zero.
-        column = a[j] - jnp.sum(columns * columns[:, j, None], axis=0)
-        column = jnp.where(rows == j, column + shift, column)
-        column = jnp.where(rows < j, 0, column * jax.lax.rsqrt(column[j]))
-        return columns.at[j].set(column)
-
-    columns = jax.lax.fori_loop(0, m, eliminate, jnp.zeros_like(a))
+    """Cholesky's factor and its inverse column by column, for all points at once."""
+    m, columns = len(a), _columns(a, shift)
     pivot = _diagonal(columns)
 
     def substitute(b):
@@ -146,6 +136,39 @@ def _by_columns(a, shift):
         return jax.lax.custom_linear_solve(times, b, solution, symmetric=True)
 
     return solve, pivot
+
+
+def _columns(a, shift):
+    """Columns of Cholesky's factor, `(m, m, *p)`, each in its row.
+
+    One after another within a few, in a loop, whose body is short: written out, 14 unknowns take
+    ten seconds to compile. Then one pass over what is left of the matrix takes them out of it.
+    """
+    m, columns = len(a), jnp.zeros_like(a)
+    for start in range(0, m, _TOGETHER):
+        few = _eliminated(a[:_TOGETHER], shift)
+        stop = start + len(few)
+        columns = columns.at[start:stop, start:].set(few)
+        if stop < m:
+            below, left = few[:, len(few) :], a[len(few) :, len(few) :]
+            left = functools.reduce(lambda a, c: a - c[:, None] * c, below, left)
+            a = jax.lax.optimization_barrier(left)
+    return columns
+
+
+def _eliminated(rows, shift):
+    """The first columns of a factor, of as many rows of a symmetric matrix."""
+    count, m = rows.shape[:2]
+    places = jnp.arange(m).reshape(m, *(1,) * (rows.ndim - 2))
+
+    def eliminate(j, columns):
+        # Columns that are not there yet are zero.
+        column = rows[j] - jnp.sum(columns * columns[:, j, None], axis=0)
+        column = jnp.where(places == j, column + shift, column)
+        column = jnp.where(places < j, 0, column * jax.lax.rsqrt(column[j]))
+        return columns.at[j].set(column)
+
+    return jax.lax.fori_loop(0, count, eliminate, jnp.zeros_like(rows))
 
 
 def _by_lapack(a, shift):

@@ -71,7 +71,8 @@ class DCPSE(AbstractMethod):
         _, high = _degrees(target.order, self.order)
         return polynomial_count(dim - 1, high)
 
-    batch_size = property(lambda self: 64 if self.order < 3 else 32)
+    # The systems of a block stay in the second-level cache.
+    batch_size = property(lambda self: 48 if self.order < 3 else 8)
     polynomial_degree = property(lambda self: max(self.order, 2))
 
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):

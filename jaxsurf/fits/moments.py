@@ -27,7 +27,14 @@ from jaxtyping import Array, Float, Shaped
 
 from ..compiling import AnyArray, namespace
 from . import systems
-from .monomials import differentiation, monomial_rows, monomials, multi_indices, position
+from .monomials import (
+    differentiation,
+    monomial_rows,
+    monomials,
+    multi_indices,
+    polynomial_count,
+    position,
+)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
@@ -172,15 +179,23 @@ def _columns(dx, v, w):
 
 def moved(a, v, dx, start, high):
     """dV a: the gradient of the polynomials with coefficients a, along dx."""
-    matrices = differentiation(len(dx), high)[:, :, start:]
+    matrices = _slopes(len(dx), start, high)
+    v = v[: matrices.shape[1]]
     return sum(systems.combine(systems.transform(d, a), v) * dx_i for d, dx_i in zip(matrices, dx))
 
 
 def add_moved_moments(rhs, eta, v, dx, start, high):
     """A right-hand side plus dV^T eta: the same matrices transposed."""
-    for d, dx_i in zip(differentiation(len(dx), high)[:, :, start:], dx):
+    matrices = _slopes(len(dx), start, high)
+    v = v[: matrices.shape[1]]
+    for d, dx_i in zip(matrices, dx):
         rhs = systems.add(rhs, systems.transform(d.T, systems.moments(v, eta * dx_i)))
     return rhs
+
+
+def _slopes(dim: int, start: int, high: int) -> np.ndarray:
+    """Coefficients of derivatives, which are a degree lower, from those of the basis."""
+    return differentiation(dim, high)[:, : polynomial_count(dim, high - 1), start:]
 
 
 @functools.cache

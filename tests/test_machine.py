@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -59,3 +62,11 @@ def test_blocks_hold_more_where_there_is_an_accelerator(monkeypatch):
     assert machine.machine() is machine.ACCELERATOR
     assert machine.block(100) == 100 * machine.ACCELERATOR.points
     assert machine.block_of_pairs(64) == 64 * machine.ACCELERATOR.pairs
+
+
+@pytest.mark.parametrize("said, quick", [("1", True), ("0", False)])
+def test_the_environment_may_ask_for_the_form_that_compiles_faster(said, quick, environment):
+    call = [sys.executable, "-c", "from jaxsurf import compiling; print(compiling.is_quick())"]
+    about = environment | {"JAXSURF_QUICKLY": said}
+    done = subprocess.run(call, env=about, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == str(quick)

@@ -147,10 +147,10 @@ def _columns(a, shift):
     m, columns = len(a), jnp.zeros_like(a)
     for start in range(0, m, _TOGETHER):
         few = _eliminated(a[:_TOGETHER], shift)
-        stop = start + len(few)
-        columns = columns.at[start:stop, start:].set(few)
-        if stop < m:
-            below, left = few[:, len(few) :], a[len(few) :, len(few) :]
+        count = len(few)
+        columns = columns.at[start : start + count, start:].set(few)
+        if start + count < m:
+            below, left = few[:, count:], a[count:, count:]
             left = functools.reduce(lambda a, c: a - c[:, None] * c, below, left)
             a = jax.lax.optimization_barrier(left)
     return columns

@@ -55,7 +55,7 @@ _ROUGHLY = 6_000, 64
 _METHOD = js.GFDM(degree=2)
 # Least cosine between normals of neighbours: those across the rim of an ear are none.
 _COSINE = 0.4
-# Of Taylor remainders.
+# Steps of Taylor remainders.
 _TAYLOR = 1e-3, 5e-4, 2.5e-4
 
 

@@ -138,21 +138,24 @@ class LevelSetShape(AbstractShape):
         points = np.asarray(unchecked_surface(self, theta).cloud.points)
         known = lambda counts: jnp.asarray([np.count_nonzero(counts), sheets.tunnels], jnp.int32)
         if np.isfinite(points).all():
-            _check_extent(np.ptp(points, axis=0), sides.size)
             counts, before = sheets.counts(points), np.asarray(self.topology)
             covered = (counts >= seen * wanted / _FEWER).all()
-            if covered and not before.any():
-                return eqx.tree_at(lambda s: s.topology, self, known(counts))
-            if covered and np.array_equal(before, known(counts)):
-                return self
+            if covered:
+                _check_extent(points, sides.size)
+                if not before.any():
+                    return eqx.tree_at(lambda s: s.topology, self, known(counts))
+                if np.array_equal(before, known(counts)):
+                    return self
         chosen = spread(phi, look, sides, cloud.n, on=lambda x: seen[sheets.at(x)])
+        _check_extent(np.asarray(chosen.points), sides.size)
         topology = known(sheets.counts(np.asarray(chosen.points)))
         surface = _listed(self.surface, chosen, k, search)
         return eqx.tree_at(lambda s: (s.surface, s.topology), self, (surface, topology))
 
 
-def _check_extent(extent: np.ndarray, cell: np.ndarray) -> None:
+def _check_extent(points: np.ndarray, cell: np.ndarray) -> None:
     """What is within one cell would be seen or not, as there is a node of the grid in it or not."""
+    extent = np.ptp(points, axis=0)
     if (extent < cell).all():
         raise ValueError(
             f"the level set vanishes: it extends over {extent.max():.2g}, less than a cell of the "

@@ -107,7 +107,7 @@ def _in_columns(a) -> bool:
 
 def _by_columns(a, shift):
     """Cholesky's factor and its inverse column by column, for all points at once."""
-    m, columns = len(a), _columns(a, shift)
+    m, columns = len(a), _cholesky(a, shift)
     pivot = _diagonal(columns)
 
     def substitute(b):
@@ -138,7 +138,7 @@ def _by_columns(a, shift):
     return solve, pivot
 
 
-def _columns(a, shift):
+def _cholesky(a, shift):
     """Columns of Cholesky's factor, `(m, m, *p)`, each in its row.
 
     One after another within a few, in a loop, whose body is short: written out, 14 unknowns take

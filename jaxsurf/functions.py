@@ -64,7 +64,7 @@ def canonical(f: Callable, *examples: Any) -> Traced:
         return out
 
     closed = jax.make_jaxpr(run)(*flat)
-    jaxpr, numbers = _without_numbers(closed.jaxpr)
+    jaxpr, numbers = _without_numbers(_what_counts(closed.jaxpr))
     own = len(jax.tree.leaves(leaves[0]))
     kept = _read(jaxpr)
     inputs = [*jaxpr.constvars, *jaxpr.invars]
@@ -137,6 +137,20 @@ class Program:
         """Tells programs apart, in another process too."""
         text = re.sub(r"0x[0-9a-f]+", "", repr(self._key))
         return f"Program({hashlib.sha256(text.encode()).hexdigest()})"
+
+
+def _what_counts(jaxpr: Jaxpr) -> Jaxpr:
+    """The program without operations that nothing needs.
+
+    Looks at what is beneath a tracer (`failures.without_derivatives`) are such: calls with a
+    derivative rule, which is another function each time.
+    """
+    needed, kept = {v for v in jaxpr.outvars if not isinstance(v, Literal)}, []
+    for equation in reversed(jaxpr.eqns):
+        if equation.effects or needed.intersection(equation.outvars):
+            kept.append(equation)
+            needed.update(v for v in equation.invars if not isinstance(v, Literal))
+    return jaxpr.replace(eqns=kept[::-1])
 
 
 def _without_numbers(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:

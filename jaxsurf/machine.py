@@ -35,6 +35,7 @@ class Machine(NamedTuple):
 
     Args:
         points: of a block, in units of what suits a CPU.
+        least: points of a block, however few suit a CPU.
         pairs: the same of points that see all others.
         slots: of an operator, added up in one pass over the memory of the result.
         gathered: weights of a scalar operator below which everything is gathered at once, without
@@ -47,6 +48,7 @@ class Machine(NamedTuple):
     """
 
     points: int
+    least: int
     pairs: int
     slots: int
     gathered: int
@@ -59,6 +61,7 @@ class Machine(NamedTuple):
 
 CPU = Machine(
     points=1,
+    least=1,
     pairs=1,
     slots=10,
     gathered=50_000,
@@ -70,6 +73,7 @@ CPU = Machine(
 )
 ACCELERATOR = Machine(
     points=256,
+    least=8192,
     pairs=16,
     slots=1_000,
     gathered=1 << 40,
@@ -88,7 +92,7 @@ def machine() -> Machine:
 
 def block(points: int) -> int:
     """Points that are treated at once where so many of them fit into the caches of a CPU."""
-    return points * machine().points
+    return max(points * machine().points, machine().least)
 
 
 def block_of_pairs(points: int) -> int:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsurf.failures import without_derivatives
 from jaxsurf.functions import canonical, numbers_as_arrays
 
 U = jnp.array([0.3, 0.5, 0.7])
@@ -26,6 +27,18 @@ def test_equal_code_is_one_program_whatever_arrays_it_closes_over():
     compiled(one, U)
     np.testing.assert_allclose(compiled(other, U), 3 * U**2 + 0.5)
     assert compiled._cached._cache_size() == 1
+
+
+def test_what_nothing_needs_does_not_count():
+    """Looks beneath tracers are calls of functions that are new each time."""
+
+    def looked(t, u):
+        without_derivatives(u)
+        return u**2 + t
+
+    one, other = (canonical(looked, 0.5, U) for _ in range(2))
+    assert one.program == other.program
+    assert one.program == canonical(lambda t, u: u**2 + t, 0.5, U).program
 
 
 def test_other_code_numbers_and_hidden_constants_make_other_programs():
@@ -76,6 +89,7 @@ def test_numbers_become_weak_arrays_and_nothing_else_changes():
 def test_the_name_of_a_program_is_the_same_in_another_process():
     code = """
 import jax, jax.numpy as jnp
+from jaxsurf.failures import without_derivatives
 from jaxsurf.functions import canonical
 f = jax.jit(lambda u, w: jnp.sort(jnp.dot(u, w)) + jax.lax.cumsum(u))
 print(canonical(lambda u: f(u, jnp.eye(3)), jnp.ones(3)).program)

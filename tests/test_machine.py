@@ -15,7 +15,7 @@ from jaxsurf import compiling, machine
 
 CLOUD = js.torus(500, 1.0, 0.4)
 # Several blocks, also of so few points.
-SMALL = machine.ACCELERATOR._replace(points=2, pairs=2)
+SMALL = machine.ACCELERATOR._replace(points=2, least=1, pairs=2)
 
 
 def _results():

@@ -12,6 +12,8 @@ import jaxsurf as js
 from jaxsurf.moving import follow
 from jaxsurf.moving.problem import Moving
 
+from .helpers import count_compilations
+
 CLOUD = js.sphere(200)
 SURFACE = js.discretize(CLOUD, method=js.GFDM(degree=2))
 X, Y, Z = CLOUD.points.T
@@ -332,6 +334,16 @@ def test_operators_of_another_surface_do_not_pass_in_silence():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         grown(t1=0.1)
+
+
+def test_a_second_run_compiles_nothing():
+    """The problem looks at the surface beneath tracers, by functions that are new each time."""
+    given = dict(t1=0.1, problem=heat, solver=dfx.Heun(), dt0=0.05)
+    grown(**given)
+    with count_compilations() as names:
+        again = grown(rate=1.1 * RATE, **given)
+    assert not names, names
+    assert again.stats["steps"] == 2
 
 
 def test_progress_bar(capfd):

@@ -22,6 +22,10 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var
 from jaxtyping import Array, PyTree
 
 
+# What is compared of functions with rules of their own: the value, the first derivative, the second.
+_DERIVATIVES = 2
+
+
 class Traced(eqx.Module):
     """A function as a program and the arrays that it closes over: made by `canonical`.
 
@@ -104,7 +108,7 @@ class Program:
 
     def __init__(self, jaxpr: Jaxpr, order, taken, given):
         self._jaxpr, self._order, self._taken, self._given = jaxpr, order, taken, given
-        self._key = (_key(jaxpr), order, taken, given)
+        self._key = (_new_key(jaxpr, _rules(_DERIVATIVES)), order, taken, given)
         self._hash = hash(self._key)
 
     @property
@@ -186,14 +190,14 @@ def _key(jaxpr: Jaxpr) -> tuple:
     """What a program does, whatever its variables are called."""
     # Programs of functions under `jit` are kept by JAX and come again.
     if jaxpr not in _KEYS:
-        _KEYS[jaxpr] = _new_key(jaxpr)
+        _KEYS[jaxpr] = _new_key(jaxpr, lambda equation: equation.params)
     return _KEYS[jaxpr]
 
 
 _KEYS: weakref.WeakKeyDictionary[Jaxpr, tuple] = weakref.WeakKeyDictionary()
 
 
-def _new_key(jaxpr: Jaxpr) -> tuple:
+def _new_key(jaxpr: Jaxpr, parameters: Callable[[Any], dict]) -> tuple:
     names: dict = {}
 
     def atom(v):
@@ -207,11 +211,34 @@ def _new_key(jaxpr: Jaxpr) -> tuple:
             equation.primitive.name,
             tuple(atom(v) for v in equation.invars),
             tuple((atom(v), v.aval) for v in equation.outvars),
-            _frozen(equation.params),
+            _frozen(parameters(equation)),
         )
         for equation in jaxpr.eqns
     )
     return len(jaxpr.constvars), inputs, equations, tuple(atom(v) for v in jaxpr.outvars)
+
+
+def _rules(derivatives: int) -> Callable[[Any], dict]:
+    """Parameters of operations; rules of derivatives as programs, of so many one after another.
+
+    JAX wraps rules anew at every call: even those of `jax.nn.relu` were never the same.
+    """
+
+    def parameters(equation) -> dict:
+        params, rule = equation.params, equation.params.get("jvp_jaxpr_fun")
+        if not hasattr(rule, "call_wrapped"):
+            return params
+        if not derivatives:
+            return {name: value for name, value in params.items() if value is not rule}
+        try:
+            zeros = [False] * (len(equation.invars) - params["num_consts"])
+            jaxpr, consts, zeros_out = rule.call_wrapped(*zeros)
+        except Exception:  # A rule that fails is told of where it is used: values do without.
+            return params
+        key = _new_key(jaxpr, _rules(derivatives - 1))
+        return params | {"jvp_jaxpr_fun": (key, consts, zeros_out)}
+
+    return parameters
 
 
 class _Same:

@@ -41,6 +41,27 @@ def test_what_nothing_needs_does_not_count():
     assert one.program == canonical(lambda t, u: u**2 + t, 0.5, U).program
 
 
+def ruled(slope):
+    """A reaction with a derivative of its own, which closes over a number and an array."""
+    factor = jnp.array([slope])
+
+    @jax.custom_jvp
+    def cubed(u):
+        return u**3
+
+    cubed.defjvp(lambda primals, tangents: (cubed(*primals), factor * tangents[0]))
+    return lambda t, u: cubed(u) + jax.nn.relu(u) + t
+
+
+def test_derivative_rules_are_told_apart_by_what_they_compute():
+    """JAX wraps them anew at each call; the same values with another derivative are no equal."""
+    one, again, other = (canonical(ruled(slope), 0.5, U).program for slope in (2.0, 2.0, 3.0))
+    assert one == again and hash(one) == hash(again) and one != other
+    broken = jax.custom_jvp(lambda u: u**3)
+    broken.defjvp(lambda primals, tangents: primals[0])
+    assert jnp.array_equal(canonical(lambda t, u: broken(u), 0.5, U)(0.5, U), U**3)
+
+
 def test_other_code_numbers_and_hidden_constants_make_other_programs():
     """Also where the text of the program is the same: constants of inner programs are not in it."""
     first = canonical(scaled(2.0), 0.5, U)

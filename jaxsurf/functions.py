@@ -21,8 +21,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var
 from jaxtyping import Array, PyTree
 
-
-# What is compared of functions with rules of their own: the value, the first derivative, the second.
+# Derivatives that are compared of functions with rules of their own, one after another.
 _DERIVATIVES = 2
 
 

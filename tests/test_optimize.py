@@ -3,6 +3,7 @@
 import functools
 import sys
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -465,3 +466,47 @@ def test_features_are_no_thinner_than_asked():
     )  # fmt: skip
     assert found.converged
     np.testing.assert_allclose(found.theta, np.sqrt(0.4), rtol=3e-2)
+
+
+@pytest.mark.parametrize("renew", [False, True])
+def test_the_same_code_with_other_numbers_compiles_nothing(renew):
+    """Written anew, as where a cell of a notebook is run again: least w a² + 1 / a²."""
+
+    def found(weight):
+        shape = js.MappedShape(lambda x, factor: factor * x, ball())
+        goal = lambda s: weight * size(s) + 1 / size(s)
+        return js.optimize_shape(
+            goal, shape, jnp.array(1.1), optimizer=LBFGS, rtol=1e-4, renew=renew
+        )
+
+    np.testing.assert_allclose(found(1.0).theta, 1, rtol=1e-3)
+    with count_compilations() as names:
+        again = found(1.2)
+    assert not names, names
+    np.testing.assert_allclose(again.theta, 1.2**-0.25, rtol=1e-3)
+
+
+class _Counted(js.AbstractShape):
+    """Twice as large once its neighbours were found anew, which no array of it tells."""
+
+    surface: js.Discretization
+    times: int = eqx.field(static=True, default=1)
+
+    def __call__(self, factor):
+        cloud = self.surface.cloud
+        points = cloud.points * jnp.stack([factor, jnp.ones(()), jnp.ones(())])
+        return self.surface.moved(self.times * points)
+
+    def renewed(self, theta, search):
+        return _Counted(super().renewed(theta, search).surface, 2)
+
+
+def test_a_shape_that_becomes_another_kind_is_seen_as_that():
+    """Least distance of the mean square from 6: nothing is twice as large without a program."""
+    found = js.optimize_shape(
+        lambda s: (size(s) - 6) ** 2, _Counted(ball()), jnp.array(1.0), optimizer=optax.sgd(0.05),
+        steps=60, rtol=1e-6, throw=False,
+    )  # fmt: skip
+    assert found.history["renewed"].sum() >= 1 and found.shape.times == 2
+    surface = found.shape(found.theta)
+    np.testing.assert_allclose(found.objective, (size(surface) - 6) ** 2, rtol=1e-9, atol=1e-12)

@@ -62,30 +62,97 @@ class Values(NamedTuple):
     forced: Multipliers
 
 
+class Violation(eqx.Module):
+    r"""What constraints are off by, $\tfrac12 \sum h^2 + \tfrac12 \sum \max(0, g)^2$."""
+
+    equalities: dict[str, Callable]
+    inequalities: dict[str, Callable]
+
+    def __call__(self, surface, *args):
+        off = [h(surface, *args) for h in self.equalities.values()]
+        off += [jnp.maximum(0, g(surface, *args)) for g in self.inequalities.values()]
+        return sum(jnp.sum(x**2) for x in off) / 2
+
+
+class Asked(NamedTuple):
+    """What the user minimises: functions of a surface and of `args`, and of parameters."""
+
+    objective: Callable
+    equalities: dict[str, Callable]
+    inequalities: dict[str, Callable]
+    project: Callable | None
+
+    def measured(self, surface: Discretization, args: tuple) -> tuple[Array, dict, dict]:
+        """Objective, equalities and inequalities."""
+        value = lambda f, name: as_float(traced_call(f, name, surface, *args), name)
+        each = lambda some: {name: value(f, f"constraint {name!r}") for name, f in some.items()}
+        return value(self.objective, "objective"), each(self.equalities), each(self.inequalities)
+
+
+class _Aside:
+    """What a problem was made of: what its programs do not tell, they are not told apart by."""
+
+    def __init__(self, asked: Asked, others: PyTree, theta: PyTree):
+        self.asked, self.others, self.theta = asked, others, theta
+
+    def __eq__(self, other):
+        return isinstance(other, _Aside)
+
+    def __hash__(self):
+        return 0
+
+
 class Problem(eqx.Module):
     r"""Minimise $f(S(\theta))$ under $h(S(\theta)) = 0$ and $g(S(\theta)) \le 0$.
 
     The augmented Lagrangian is $f + \sum (\lambda h + \tfrac\mu2 h^2) + \sum \tfrac1{2\mu}
     (\max(0, \nu + \mu g)^2 - \nu^2)$: NaN where the surface is not one.
+
+    Functions are the programs that they are, so that the same code with other numbers in it, or
+    another shape of the same size, compiles nothing.
+
+    Args:
+        arrays: of the shape, where neighbours are renewed; else they are in the program.
+        seen: what is wrong with the surface, whether its lists are worn, and what is measured.
+        project: to parameters that are allowed.
+        args: of the user's functions.
     """
 
-    shape: AbstractShape | Callable
-    objective: Callable
-    equalities: dict[str, Callable]
-    inequalities: dict[str, Callable]
+    arrays: list[Array]
+    seen: Traced
+    project: Traced | None
     args: tuple
-    project: Callable | None
+    _made_of: _Aside = eqx.field(static=True)
 
-    def measured(self, surface: Discretization) -> tuple[Array, dict, dict]:
-        """Objective, equalities and inequalities."""
-        value = lambda f, name: as_float(traced_call(f, name, surface, *self.args), name)
-        each = lambda some: {name: value(f, f"constraint {name!r}") for name, f in some.items()}
-        return value(self.objective, "objective"), each(self.equalities), each(self.inequalities)
+    @classmethod
+    def of(cls, asked: Asked, shape: AbstractShape, theta, args: tuple, renew: bool) -> Problem:
+        """For shapes of these arrays, or for this one."""
+        arrays, others = eqx.partition(shape, eqx.is_array if renew else False)
+        arrays, structure = jax.tree.flatten(arrays)
+
+        def seen(arrays, theta, args):
+            surface = eqx.combine(jax.tree.unflatten(structure, arrays), others)(theta)
+            return *_judged(surface), asked.measured(surface, args)
+
+        with marking():
+            project = None if asked.project is None else canonical(asked.project, theta)
+            made_of = _Aside(asked, others, theta)
+            return cls(arrays, canonical(seen, arrays, theta, args), project, args, made_of)
+
+    def at(self, shape: AbstractShape) -> Problem:
+        """The same with other arrays of the shape; with other programs where it is another kind."""
+        if not self.arrays:
+            return self
+        arrays, others = eqx.partition(shape, eqx.is_array)
+        flat = jax.tree.leaves(arrays)
+        sizes = lambda some: [(a.shape, a.dtype) for a in some]
+        made_of = self._made_of
+        if sizes(flat) != sizes(self.arrays) or not eqx.tree_equal(others, made_of.others):
+            return Problem.of(made_of.asked, shape, made_of.theta, self.args, True)
+        return eqx.tree_at(lambda problem: problem.arrays, self, flat)
 
     def lagrangian(self, theta: PyTree, multipliers: Multipliers) -> tuple[Array, Any]:
-        surface = self.shape(theta)
-        code, worn = _judged(surface)
-        f, h, g = self.measured(surface)
+        code, worn, (f, h, g) = self.seen(self.arrays, theta, self.args)
         lambdas, nus, mu = multipliers
         value, violation, forces = f, jnp.zeros_like(f), Multipliers({}, {}, mu)
         for name, x in h.items():
@@ -160,10 +227,12 @@ def direction(
     def lagrangian(theta):
         return seen(theta)[0]
 
-    def seen(theta):
+    def seen(there):
+        # A search in single precision may go on in double.
+        of_type = lambda new, old: new.astype(old.dtype)
         with jax.disable_jit(False):
-            values = look(theta)
-        return values.lagrangian, values.gradient
+            values = look(jax.tree.map(of_type, there, theta))
+        return values.lagrangian, jax.tree.map(of_type, values.gradient, there)
 
     slopes = lambda gradient, scale: (jax.tree.map(lambda g: scale * g, gradient),)
     lagrangian.defvjp(seen, slopes)
@@ -201,19 +270,6 @@ def strong(tree: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.asarray(x).dtype), tree)
 
 
-def computed(problem: Problem, theta: PyTree) -> list[Traced]:
-    """What the user's functions compute, as programs, which tell them apart."""
-    measured = lambda theta: problem.measured(problem.shape(theta))
-    with marking():
-        return [canonical(f, theta) for f in (measured, problem.projected)]
-
-
 def kinds(problem: Problem, theta: PyTree) -> tuple:
     """Shapes and types of objective, equalities and inequalities."""
-    with marking():
-        return eqx.filter_eval_shape(_kinds, problem, theta)
-
-
-@sized_jit
-def _kinds(problem, theta):
-    return problem.measured(problem.shape(theta))
+    return eqx.filter_eval_shape(problem.seen, problem.arrays, theta, problem.args)[2]

@@ -20,10 +20,11 @@ from ..renew import NeighborSearch
 from ..time.checkpoint import Checkpoint, digest, read_back, written
 from .asked import FAR, ILL, refuse_start
 from .lagrangian import (
+    Asked,
     Multipliers,
     Problem,
     Values,
-    computed,
+    Violation,
     direction,
     evaluated,
     kinds,
@@ -75,34 +76,6 @@ class _Run(NamedTuple):
     history: dict[str, np.ndarray]
 
 
-class _Violation(eqx.Module):
-    r"""What constraints are off by, $\tfrac12 \sum h^2 + \tfrac12 \sum \max(0, g)^2$."""
-
-    equalities: dict[str, Callable]
-    inequalities: dict[str, Callable]
-
-    def __call__(self, surface, *args):
-        off = [h(surface, *args) for h in self.equalities.values()]
-        off += [jnp.maximum(0, g(surface, *args)) for g in self.inequalities.values()]
-        return sum(jnp.sum(x**2) for x in off) / 2
-
-
-class _Held:
-    """A shape whose arrays are constants of the programs."""
-
-    def __init__(self, shape: AbstractShape):
-        self.shape = shape
-
-    def __call__(self, theta):
-        return self.shape(theta)
-
-    def __hash__(self):
-        return id(self.shape)
-
-    def __eq__(self, other):
-        return isinstance(other, _Held) and self.shape is other.shape
-
-
 class _File(NamedTuple):
     """Where a run is written, after how many steps, and what it is known by."""
 
@@ -122,10 +95,7 @@ class _File(NamedTuple):
 class Loop(NamedTuple):
     """What does not change during a run."""
 
-    objective: Callable
-    equalities: dict[str, Callable]
-    inequalities: dict[str, Callable]
-    project: Callable | None
+    asked: Asked
     args: tuple
     optimizer: Any
     numbers: dict[str, Any]
@@ -145,19 +115,19 @@ class Loop(NamedTuple):
             shape = shape.renewed(theta, surface.search())
         search = surface.search() if renew else None
         shape = with_wear(shape) if renew else shape
-        problem = self.problem(shape)
+        problem = Problem.of(self.asked, shape, theta, self.args, renew)
         run = self.first(problem, shape, theta)
         file = None
         if self.checkpoint is not None:
             known = (self._replace(callback=None, checkpoint=None), shape, theta)
-            told = digest((known, computed(problem, theta)))
+            told = digest((known, problem))
             file = _File(Path(self.checkpoint.path), max(1, round(self.checkpoint.every)), told)
             run = file.read(run)
             shape = eqx.combine(run.lists, shape)
         clock -= float(run.history["seconds"][int(run.step)])
         stopped, failed = self.ended(run), False
         while not stopped:
-            run, shape, stopped = self.step(self.problem(shape), shape, run, search)
+            run, shape, stopped = self.step(problem, shape, run, search)
             run.history["seconds"][int(run.step)] = time.perf_counter() - clock
             failed = bool(stopped)
             if failed:
@@ -171,10 +141,6 @@ class Loop(NamedTuple):
             if self.callback is not None and self.callback(self.found(run, shape, stopped)):
                 stopped = stopped or "ended by the callback"
         return self.found(run, shape, stopped), failed
-
-    def problem(self, shape) -> Problem:
-        held = shape if self.numbers["renew"] else _Held(shape)
-        return Problem(held, *self[:3], self.args, self.project)
 
     def first(self, problem, shape, theta) -> _Run:
         """At the start, if it is good."""
@@ -211,9 +177,11 @@ class Loop(NamedTuple):
     def step(self, problem, shape, run: _Run, search) -> tuple[_Run, AbstractShape, str]:
         """One step, what it asks for, and why there is none."""
 
+        problem = problem.at(shape)
+
         def look(theta, *updates):
             theta, values = evaluated(problem, theta, run.multipliers, *updates)
-            return self.covered(shape, theta, values, run.multipliers, search), theta
+            return covered(problem, shape, theta, values, run.multipliers, search), theta
 
         ills: list[str] = []
 
@@ -228,52 +196,32 @@ class Loop(NamedTuple):
             (covering, values, ill), theta = look(run.theta, updates, 0.5**refused)
             anew = covering
             if not ill and bool(values.worn) and search is not None:
-                anew, ill = self.renewed(covering, theta, run.multipliers, search)
+                anew, ill = renewed(problem, covering, theta, run.multipliers, search)
             if not ill:
                 break
         else:
             return run, shape, _halved(run, ill)
-        rebuilt, renewed, shape = covering is not shape, anew is not covering, anew
+        is_rebuilt, is_renewed, shape = covering is not shape, anew is not covering, anew
         still, why = _same(run.theta, theta), ""
         run = run._replace(
             step=run.step + 1, theta=theta, state=state, values=values, since=run.since + 1
         )
-        if renewed or rebuilt:
+        if is_renewed or is_rebuilt:
             run = run._replace(lists=eqx.filter(shape, eqx.is_array))
         small = float(values.size) <= float(run.goal) * float(run.first)
-        corrected = bool(self.equalities or self.inequalities) and (
+        corrected = bool(self.asked.equalities or self.asked.inequalities) and (
             still or small or int(run.since) >= _INNER
         )
         if corrected:
             run = self.corrected(run, solved=still or small)
-        if renewed or rebuilt or corrected:
-            run = _seen_again(self.problem(shape), run, self.optimizer)
+        if is_renewed or is_rebuilt or corrected:
+            run = _seen_again(problem.at(shape), run, self.optimizer)
         elif still:
             why = "no step along the search lowers the objective"
             if ills:
                 why += f", and farther along it {ills[-1]}: the last good shape is kept"
-        _note(run, refused=refused, renewed=renewed, rebuilt=rebuilt)
+        _note(run, refused=refused, renewed=is_renewed, rebuilt=is_rebuilt)
         return run, shape, why
-
-    def covered(self, shape, theta, values, multipliers, search):
-        """A shape whose points cover the surface at theta, what is seen of it, what is wrong."""
-        try:
-            covering = shape if search is None else _quietly(shape.rebuilt, theta, search)
-        except ValueError as error:
-            return shape, values, str(error)
-        if covering is not shape:
-            values = evaluated(self.problem(covering), theta, multipliers)[1]
-        code = int(values.code)
-        return covering, values, ILL[code] if code else ""
-
-    def renewed(self, shape, theta, multipliers, search) -> tuple[AbstractShape, str]:
-        """The shape with neighbours found anew at theta, and what is wrong with it."""
-        try:
-            anew = _renewed(shape, theta, search)
-        except ValueError as error:
-            return shape, f"neighbours could not be found anew: {error}"
-        code = int(evaluated(self.problem(anew), theta, multipliers)[1].code)
-        return anew, f"with neighbours found anew {ILL[code]}" if code else ""
 
     def corrected(self, run: _Run, solved: bool) -> _Run:
         """With forces that the constraints were met with, and the penalty that this asks for.
@@ -287,7 +235,7 @@ class Loop(NamedTuple):
         if wrong and solved and now > _FALLS * last:
             multipliers = multipliers._replace(penalty=_GROWTH * multipliers.penalty)
         # Under a projection they are not minimised alone.
-        counts = solved or self.project is None
+        counts = solved or self.asked.project is None
         stalls = run.stalls + counts if wrong and now > _STAYS * last else np.array(0)
         goal = np.maximum(self.numbers["rtol"], _GOAL * run.goal)
         return run._replace(
@@ -302,7 +250,7 @@ class Loop(NamedTuple):
         if off <= self.numbers["ctol"] or not stalls or not (often or last):
             return ""
         text = f"constraints are not met: a violation of {off:.3g} has stayed"
-        if self.project is None:
+        if self.asked.project is None:
             if self.is_lessened(shape, run.theta):
                 return ""
             text += ", and is not lessened where they alone count either"
@@ -313,10 +261,10 @@ class Loop(NamedTuple):
     def is_lessened(self, shape, theta) -> bool:
         """Whether constraints come nearer where they alone are minimised."""
         met = lambda now: bool(now.objective <= self.numbers["ctol"] ** 2 / 2)
+        off = Violation(self.asked.equalities, self.asked.inequalities)
         alone = self._replace(
-            objective=_Violation(self.equalities, self.inequalities), equalities={},
-            inequalities={}, optimizer=optax.lbfgs(), callback=met, checkpoint=None,
-            numbers=self.numbers | dict(steps=_ALONE),
+            asked=Asked(off, {}, {}, None), optimizer=optax.lbfgs(), callback=met,
+            checkpoint=None, numbers=self.numbers | dict(steps=_ALONE),
         )  # fmt: skip
         violation = alone.run(shape, theta)[0].history["objective"]
         return bool(violation[-1] <= _STAYS**2 * violation[0])
@@ -339,6 +287,28 @@ class Loop(NamedTuple):
             run.theta, shape, v.objective, v.equalities, v.inequalities, forces, rows,
             stopped == "converged", stopped or "under way",
         )  # fmt: skip
+
+
+def covered(problem, shape, theta, values, multipliers, search):
+    """A shape whose points cover the surface at theta, what is seen of it, what is wrong."""
+    try:
+        covering = shape if search is None else _quietly(shape.rebuilt, theta, search)
+    except ValueError as error:
+        return shape, values, str(error)
+    if covering is not shape:
+        values = evaluated(problem.at(covering), theta, multipliers)[1]
+    code = int(values.code)
+    return covering, values, ILL[code] if code else ""
+
+
+def renewed(problem, shape, theta, multipliers, search) -> tuple[AbstractShape, str]:
+    """The shape with neighbours found anew at theta, and what is wrong with it."""
+    try:
+        anew = _renewed(shape, theta, search)
+    except ValueError as error:
+        return shape, f"neighbours could not be found anew: {error}"
+    code = int(evaluated(problem.at(anew), theta, multipliers)[1].code)
+    return anew, f"with neighbours found anew {ILL[code]}" if code else ""
 
 
 def _halved(run: _Run, ill: str) -> str:

@@ -11,7 +11,7 @@ from ..arguments import flag, floating, further, real, whole
 from ..failures import needs_values
 from ..time.checkpoint import Checkpoint
 from .asked import check_asked, check_projection, constraints
-from .lagrangian import strong
+from .lagrangian import Asked, strong
 from .loop import Loop
 from .outcome import OptimizationError, ShapeOptimization
 from .shape import AbstractShape
@@ -116,7 +116,8 @@ def optimize_shape(
         renew=flag(renew, "renew"),
     )
     needs_values("theta, shape, args and tolerances", theta, shape, args, numbers)
-    loop = Loop(objective, *asked, project, args, optimizer, numbers, callback, checkpoint)
+    wanted = Asked(objective, *asked, project)
+    loop = Loop(wanted, args, optimizer, numbers, callback, checkpoint)
     found, failed = loop.run(shape, theta)
     if failed and throw:
         raise OptimizationError(found.stopped, found)

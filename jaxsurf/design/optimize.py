@@ -60,8 +60,8 @@ def optimize_shape(
         project: takes parameters to the nearest that are allowed, at the start and after every
             step of a first-order method: one of `optax.projections`, say. L-BFGS is refused: its
             search along a line does not know of it.
-        args: further arguments of all these; other values compile nothing, where other
-            functions do.
+        args: further arguments of all these. Neither other values of them compile anything, nor
+            other numbers in functions of the same code.
         steps: at most.
         rtol: it has converged where the gradient of the Lagrangian, less what a projection takes of
             it, is this share of its first,

@@ -110,7 +110,6 @@ def test_numbers_become_weak_arrays_and_nothing_else_changes():
 def test_the_name_of_a_program_is_the_same_in_another_process():
     code = """
 import jax, jax.numpy as jnp
-from jaxsurf.failures import without_derivatives
 from jaxsurf.functions import canonical
 f = jax.jit(lambda u, w: jnp.sort(jnp.dot(u, w)) + jax.lax.cumsum(u))
 print(canonical(lambda u: f(u, jnp.eye(3)), jnp.ones(3)).program)

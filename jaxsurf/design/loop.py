@@ -127,6 +127,7 @@ class Loop(NamedTuple):
         clock -= float(run.history["seconds"][int(run.step)])
         stopped, failed = self.ended(run), False
         while not stopped:
+            problem = problem.at(shape)
             run, shape, stopped = self.step(problem, shape, run, search)
             run.history["seconds"][int(run.step)] = time.perf_counter() - clock
             failed = bool(stopped)
@@ -177,11 +178,9 @@ class Loop(NamedTuple):
     def step(self, problem, shape, run: _Run, search) -> tuple[_Run, AbstractShape, str]:
         """One step, what it asks for, and why there is none."""
 
-        problem = problem.at(shape)
-
         def look(theta, *updates):
             theta, values = evaluated(problem, theta, run.multipliers, *updates)
-            return covered(problem, shape, theta, values, run.multipliers, search), theta
+            return _covered(problem, shape, theta, values, run.multipliers, search), theta
 
         ills: list[str] = []
 
@@ -196,17 +195,17 @@ class Loop(NamedTuple):
             (covering, values, ill), theta = look(run.theta, updates, 0.5**refused)
             anew = covering
             if not ill and bool(values.worn) and search is not None:
-                anew, ill = renewed(problem, covering, theta, run.multipliers, search)
+                anew, ill = _with_new_lists(problem, covering, theta, run.multipliers, search)
             if not ill:
                 break
         else:
             return run, shape, _halved(run, ill)
-        is_rebuilt, is_renewed, shape = covering is not shape, anew is not covering, anew
+        rebuilt, renewed, shape = covering is not shape, anew is not covering, anew
         still, why = _same(run.theta, theta), ""
         run = run._replace(
             step=run.step + 1, theta=theta, state=state, values=values, since=run.since + 1
         )
-        if is_renewed or is_rebuilt:
+        if renewed or rebuilt:
             run = run._replace(lists=eqx.filter(shape, eqx.is_array))
         small = float(values.size) <= float(run.goal) * float(run.first)
         corrected = bool(self.asked.equalities or self.asked.inequalities) and (
@@ -214,13 +213,13 @@ class Loop(NamedTuple):
         )
         if corrected:
             run = self.corrected(run, solved=still or small)
-        if is_renewed or is_rebuilt or corrected:
+        if renewed or rebuilt or corrected:
             run = _seen_again(problem.at(shape), run, self.optimizer)
         elif still:
             why = "no step along the search lowers the objective"
             if ills:
                 why += f", and farther along it {ills[-1]}: the last good shape is kept"
-        _note(run, refused=refused, renewed=is_renewed, rebuilt=is_rebuilt)
+        _note(run, refused=refused, renewed=renewed, rebuilt=rebuilt)
         return run, shape, why
 
     def corrected(self, run: _Run, solved: bool) -> _Run:
@@ -289,7 +288,7 @@ class Loop(NamedTuple):
         )  # fmt: skip
 
 
-def covered(problem, shape, theta, values, multipliers, search):
+def _covered(problem, shape, theta, values, multipliers, search):
     """A shape whose points cover the surface at theta, what is seen of it, what is wrong."""
     try:
         covering = shape if search is None else _quietly(shape.rebuilt, theta, search)
@@ -301,7 +300,7 @@ def covered(problem, shape, theta, values, multipliers, search):
     return covering, values, ILL[code] if code else ""
 
 
-def renewed(problem, shape, theta, multipliers, search) -> tuple[AbstractShape, str]:
+def _with_new_lists(problem, shape, theta, multipliers, search) -> tuple[AbstractShape, str]:
     """The shape with neighbours found anew at theta, and what is wrong with it."""
     try:
         anew = _renewed(shape, theta, search)

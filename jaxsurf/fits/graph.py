@@ -30,27 +30,40 @@ class Graph(eqx.Module):
         plane = TangentPlane.of(around, degree)
         return plane, cls(plane.surface(1, degree)[0], degree, len(plane.points))
 
-    @property
-    def slopes(self) -> list[list[Array]]:
-        """Coefficients of the derivatives along the axes, by degree from 0 to `degree` - 1."""
+    def by_degree(self) -> Expansion:
+        """Its coefficients and those of its slopes, degree by degree."""
+        last = [polynomial_count(self.dim, g) for g in range(self.degree + 1)]
+        heights = jnp.split(self.coefficients, [count - 1 for count in last[1:-1]])
+        parts = [slice(start, stop) for start, stop in zip([0, *last], last[:-1])]
         matrices = differentiation(self.dim, self.degree)[:, :, 1:]
-        return [
-            [_places(matrix[part], self.coefficients) for part in self.parts[:-1]]
-            for matrix in matrices
+        slopes = [
+            [_places(matrix[part], self.coefficients) for part in parts] for matrix in matrices
         ]
+        return Expansion(heights, slopes, self.degree)
+
+
+class Expansion(eqx.Module):
+    """A graph with all that it takes to evaluate it, by degree.
+
+    Args:
+        heights: coefficients of degree 1 to `degree`.
+        slopes: those of the derivatives along each axis, of degree 0 to `degree` - 1.
+    """
+
+    heights: list[Float[Array, "_ *p"]]
+    slopes: list[list[Float[Array, "_ *p"]]]
+    degree: int = eqx.field(static=True)
 
     @property
-    def parts(self) -> list[slice]:
-        """Which of all monomials are of each degree."""
-        last = [polynomial_count(self.dim, g) for g in range(self.degree + 1)]
-        return [slice(start, stop) for start, stop in zip([0, *last], last)]
+    def dim(self) -> int:
+        """Of the tangent plane."""
+        return len(self.slopes)
 
     def at(self, q):
         """Heights and slopes."""
         rows = monomials_by_degree(q, self.degree)
-        own = [self.coefficients[part.start - 1 : part.stop - 1] for part in self.parts[1:]]
         slopes = jnp.stack([polynomial(c, rows) for c in self.slopes])
-        return polynomial(own, rows[1:]), slopes
+        return polynomial(self.heights, rows[1:]), slopes
 
 
 def polynomial(coefficients: list[Array], rows: list[Array]) -> Array:

@@ -36,6 +36,9 @@ from .monomials import (
     position,
 )
 
+# The name of what is worth storing until derivatives need it: short, and long to compute.
+KEPT = "kept"
+
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
 def moment_solve(
@@ -260,13 +263,15 @@ def out_of_blocks(a: Shaped[Array, "blocks *s size"], n: int) -> Shaped[Array, "
 def blockwise(f: Callable, blocks, count=None):
     """`f` on one block after another: memory stays flat.
 
-    In reverse mode each block is computed again from its inputs instead of being stored.
+    In reverse mode each block is computed again from its inputs and from what has the name `KEPT`
+    (`jax.ad_checkpoint.checkpoint_name`) instead of being stored.
 
     Args:
         count: only so many of them, may be traced; not differentiable then. None: all.
     """
     if count is None:
-        return jax.lax.map(jax.checkpoint(f), blocks)
+        kept = jax.checkpoint_policies.save_only_these_names(KEPT)
+        return jax.lax.map(jax.checkpoint(f, policy=kept), blocks)
     f = jax.jit(f)  # traced once
     at, put_at = jax.lax.dynamic_index_in_dim, jax.lax.dynamic_update_index_in_dim
     block = lambda i: jax.tree.map(lambda a: at(a, i, keepdims=False), blocks)

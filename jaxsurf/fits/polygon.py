@@ -15,15 +15,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
-from .graph import Graph, polynomial
+from .graph import Expansion, Graph, polynomial
+from .moments import KEPT
 from .monomials import monomials_by_degree, polynomial_count
 from .plane import TangentPlane
 
-# Newton steps from cells with straight sides to those on the surface end with one as small as this,
-# or after so many: each squares what is left of an error of the size (spacing x curvature)^2. The
-# derivative is off by what is left.
+# Newton steps from cells with straight sides to those on the surface end with the one after one as
+# small as this, or after so many: each squares what is left of an error of the size
+# (spacing x curvature)^2.
 _SMALL, _STEPS = 1e-4, 8
 # Sides that it puts so much farther out than straight ones, or behind the point, are not found.
 _STRETCH = 2.0
@@ -64,9 +66,8 @@ class Sides(eqx.Module):
         flat = jnp.stack([pick(a) for a in self.flat])
         return Sides(flat, pick(self.high), pick(self.offset), jnp.ones_like(which, bool))
 
-    def miss(self, graph: Graph, q):
-        """How far the points of the surface over q are beyond them, and the slope of that."""
-        z, slope = graph.at(q)
+    def miss(self, q, z, slope):
+        """How far points over q with these heights are beyond them, and the slope of that."""
         beyond = jnp.sum(q * self.flat, axis=0) + z * self.high - self.offset
         return beyond, self.flat + slope * self.high
 
@@ -76,6 +77,11 @@ def moments_over(sides: Sides, graph: Graph, ways):
 
     The latter squared.
     """
+    size = polynomial_count(graph.dim, graph.degree)
+    return _moments_over(sides, graph.by_degree(), ways, size)
+
+
+def _moments_over(sides: Sides, graph: Expansion, ways, size: int):
     if graph.dim == 1:
         found, reach = _along_ways(sides.chosen(ways[2]), graph, *ways[:2])
         # The nearest to either side bound a curve's cell, if it is found at all.
@@ -90,16 +96,15 @@ def moments_over(sides: Sides, graph: Graph, ways):
 
     def half(these):
         side, after, ended = these
-        none = jnp.zeros((size, *side.shape[1:]), graph.coefficients.dtype)
+        none = jnp.zeros((size, *side.shape[1:]), sides.offset.dtype)
         of_sides = lambda: _over_sides(sides.chosen(side), sides.chosen(after), graph)
         return jax.lax.cond(ended, lambda: (none, none[0]), of_sides)
 
-    size = polynomial_count(graph.dim, graph.degree)
     found, reach = jax.lax.map(half, (side[halves], after[halves], jnp.stack(ended)))
     return jnp.sum(found, axis=0), jnp.max(reach, axis=0)
 
 
-def _over_sides(these: Sides, those: Sides, graph: Graph):
+def _over_sides(these: Sides, those: Sides, graph: Expansion):
     """What triangles between the point and each side add to the moments of a cell.
 
     Args:
@@ -107,12 +112,13 @@ def _over_sides(these: Sides, those: Sides, graph: Graph):
         those: what cuts each of them off.
     """
 
-    def newton(q, these, those, graph):
-        (u, a), (v, b) = these.miss(graph, q), those.miss(graph, q)
-        return q - _meeting(u, v, *jax.lax.stop_gradient((a, b)))
+    def misses(q, these, those, graph):
+        at = graph.at(q)
+        (u, a), (v, b) = these.miss(q, *at), those.miss(q, *at)
+        return (u, v), lambda u, v: _meeting(u, v, a, b)
 
     straight = _meeting(these.offset, those.offset, these.flat, those.flat)
-    corners, lost = _root(newton, straight, these, those, graph)
+    corners, lost = _root(misses, straight, these, those, graph)
     first, last = corners[:, :-1], corners[:, 1:]
     turn = first[0] * last[1] - first[1] * last[0]
     share, weights = _gauss(_nodes(graph), 0)
@@ -124,7 +130,7 @@ def _over_sides(these: Sides, those: Sides, graph: Graph):
     return found, jnp.maximum(jnp.max(far, axis=0), reach)
 
 
-def _along_ways(sides: Sides, graph: Graph, ends, measure):
+def _along_ways(sides: Sides, graph: Expansion, ends, measure):
     """The moments from those of ways that end at sides, and how far these reach, squared.
 
     That is infinite where the surface bends so much within the cell that a side is not found.
@@ -135,12 +141,13 @@ def _along_ways(sides: Sides, graph: Graph, ends, measure):
     """
     degree, nodes = graph.degree, _nodes(graph)
 
-    def newton(length, sides, graph, ends):
-        beyond, slope = sides.miss(graph, length * ends)
-        rate = jax.lax.stop_gradient(jnp.sum(slope * ends, axis=0))
-        return length - beyond / jnp.where(rate > 0, rate, 1)
+    def misses(length, sides, graph, ends):
+        q = length * ends
+        beyond, slope = sides.miss(q, *graph.at(q))
+        rate = jnp.sum(slope * ends, axis=0)
+        return (beyond,), lambda beyond: beyond / jnp.where(rate > 0, rate, 1)
 
-    length, lost = _root(newton, jnp.ones_like(measure), sides, graph, ends)
+    length, lost = _root(misses, jnp.ones_like(measure), sides, graph, ends)
     ends = length * ends
     measure = measure * length**graph.dim
 
@@ -162,7 +169,7 @@ def _along_ways(sides: Sides, graph: Graph, ends, measure):
     return jnp.concatenate(found), jnp.max(reach, axis=0)
 
 
-def _nodes(graph: Graph) -> int:
+def _nodes(graph: Expansion) -> int:
     """Of Gauss's rule: exact for the polynomials of the surface."""
     return graph.degree // 2 + 1
 
@@ -238,24 +245,39 @@ def _ways_of_curve(sides: Sides):
     return (ends[None], jnp.abs(ends), which), jnp.where(closed, 0, -1)
 
 
-def _root(newton: Callable, start, *known):
-    """The end of Newton's method, of which the last step has the derivative of the root.
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _root(misses: Callable, start, *known):
+    """Where what is missed vanishes, by Newton's method, and whether that was lost: then the start.
 
-    And where it was lost: the value is then that of one step.
+    Args:
+        misses: of x and what is known: a tuple of what is missed there, and a function that
+            divides such a tuple by its slope in x.
+
+    Differentiable: in what is known, to any order, by the implicit function theorem.
     """
-    fixed, start = jax.lax.stop_gradient((known, start))
 
     def step(state):
-        count, x, _ = state
-        new = newton(x, *fixed)
-        return count + 1, new, jnp.max(jnp.abs(new - x))
+        count, x, moved, _ = state
+        missed, divided = misses(x, *known)
+        new = x - divided(*missed)
+        return count + 1, new, jnp.max(jnp.abs(new - x)), moved
 
-    moves = lambda state: (state[0] < _STEPS) & ~(state[2] < _SMALL)
-    near = jax.lax.while_loop(moves, step, step((0, start, None)))[1]
-    lost = ~(jnp.abs(near - start) < _STRETCH * (1 + jnp.abs(start)))
-    near = jax.lax.stop_gradient(jnp.where(lost, start, near))
-    # Without the barrier the compiler finds the value again for every use of it.
-    return jax.lax.optimization_barrier(newton(near, *known)), lost
+    # One step more than to one that is small.
+    moves = lambda state: (state[0] < _STEPS) & ~(state[3] < _SMALL)
+    infinite = jnp.asarray(jnp.inf, start.dtype)
+    x = jax.lax.while_loop(moves, step, (0, start, infinite, infinite))[1]
+    lost = ~(jnp.abs(x - start) < _STRETCH * (1 + jnp.abs(start)))
+    return jnp.where(lost, start, x), lost
+
+
+@_root.defjvp
+def _root_jvp(misses, primals, tangents):
+    (start, *known), (_, *moved) = primals, tangents
+    x, lost = _root(misses, start, *known)
+    x = checkpoint_name(x, KEPT)
+    divided = misses(x, *known)[1]
+    _, missed = jax.jvp(lambda *known: misses(x, *known)[0], known, moved)
+    return (x, lost), (-divided(*missed), np.zeros(lost.shape, jax.dtypes.float0))
 
 
 @functools.cache

@@ -68,7 +68,8 @@ class Expansion(eqx.Module):
 
 def polynomial(coefficients: list[Array], rows: list[Array]) -> Array:
     """Sum over all degrees, kept apart: to put slices together again takes longer than all else."""
-    parts = [jnp.sum(c[:, None] * row, axis=0) for c, row in zip(coefficients, rows)]
+    shaped = lambda c, row: c.reshape(len(c), *(1,) * (row.ndim - c.ndim), *c.shape[1:])
+    parts = [jnp.sum(shaped(c, row) * row, axis=0) for c, row in zip(coefficients, rows)]
     return functools.reduce(jnp.add, parts)
 
 

@@ -78,8 +78,7 @@ def _solve(x, w, b, low, high):
     s = systems.combine(a, v[start:])
     eta = w * s
     # The moments of eta are A a.
-    found = systems.symmetric(gram, a)
-    error = jnp.abs((jnp.stack(found) if small else found) - b)
+    error = jnp.abs(systems.symmetric(gram, a) - b)
     size = jnp.max(jnp.abs(b), axis=(0, 1))
     residual = jnp.max(error, axis=(0, 1)) / jnp.where(size > 0, size, 1)
     return (eta, condition, residual), (v, start, solve, a, s)
@@ -215,14 +214,19 @@ def _gather_table(dim: int, low: int, high: int) -> tuple[np.ndarray, np.ndarray
     return rows.astype(np.int32), total[..., -1].astype(np.int32)
 
 
+@functools.cache
+def _places(dim: int, low: int, high: int) -> np.ndarray:
+    """Where the moment of multi-index beta + gamma stands among all up to twice the degree."""
+    basis, place = multi_indices(dim, low, high), position(dim, 2 * high)
+    total = (basis[:, None] + basis).tolist()
+    return np.array([[place[tuple(g)] for g in row] for row in total], np.int32)
+
+
 def gram_matrix(x, w, low, high):
-    """The matrix A, each moment summed once; in small systems as lists of rows."""
-    basis = multi_indices(len(x), low, high)
+    """The matrix A, each moment summed once."""
     if _is_small(x, low, high):
-        place = position(len(x), 2 * high)
-        sums = [jnp.sum(row, axis=0) for row in monomial_rows(x, 2 * high, w)]
-        total = (basis[:, None] + basis).tolist()
-        return [[sums[place[tuple(g)]] for g in row] for row in total]
+        sums = jnp.stack([jnp.sum(row, axis=0) for row in monomial_rows(x, 2 * high, w)])
+        return sums[_places(len(x), low, high)]
     # Moments as one small matrix product: monomials in all coordinates but the last, times
     # powers of the last.
     powers, xp = monomials(x[-1:], 2 * high), namespace(x)

@@ -19,7 +19,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
 from .graph import Expansion, Graph, polynomial
-from .moments import KEPT
+from .moments import KEPT, blockwise
 from .monomials import monomials_by_degree, polynomial_count
 from .plane import TangentPlane
 
@@ -66,11 +66,6 @@ class Sides(eqx.Module):
         flat = jnp.stack([pick(a) for a in self.flat])
         return Sides(flat, pick(self.high), pick(self.offset), jnp.ones_like(which, bool))
 
-    def miss(self, q, z, slope):
-        """How far points over q with these heights are beyond them, and the slope of that."""
-        beyond = jnp.sum(q * self.flat, axis=0) + z * self.high - self.offset
-        return beyond, self.flat + slope * self.high
-
 
 def moments_over(sides: Sides, graph: Graph, ways):
     r"""$\int q^\gamma\,dA$ over a cell for all monomials up to the degree, and how far it reaches.
@@ -83,7 +78,8 @@ def moments_over(sides: Sides, graph: Graph, ways):
 
 def _moments_over(sides: Sides, graph: Expansion, ways, size: int):
     if graph.dim == 1:
-        found, reach = _along_ways(sides.chosen(ways[2]), graph, *ways[:2])
+        ends, measure, which = ways
+        found, reach = _along_ways(sides.chosen(which), graph, ends[:, None], measure[None])
         # The nearest to either side bound a curve's cell, if it is found at all.
         return found, jnp.where(reach < jnp.inf, 0, reach)
     side, still = ways
@@ -100,7 +96,7 @@ def _moments_over(sides: Sides, graph: Expansion, ways, size: int):
         of_sides = lambda: _over_sides(sides.chosen(side), sides.chosen(after), graph)
         return jax.lax.cond(ended, lambda: (none, none[0]), of_sides)
 
-    found, reach = jax.lax.map(half, (side[halves], after[halves], jnp.stack(ended)))
+    found, reach = blockwise(half, (side[halves], after[halves], jnp.stack(ended)))
     return jnp.sum(found, axis=0), jnp.max(reach, axis=0)
 
 
@@ -112,19 +108,24 @@ def _over_sides(these: Sides, those: Sides, graph: Expansion):
         those: what cuts each of them off.
     """
 
-    def misses(q, these, those, graph):
-        at = graph.at(q)
-        (u, a), (v, b) = these.miss(q, *at), those.miss(q, *at)
-        return (u, v), lambda u, v: _meeting(u, v, a, b)
+    # The planes of two sides meet in a line, which leans by so much over the plane.
+    foot = _meeting(these.offset, those.offset, these.flat, those.flat)
+    lean = -_meeting(these.high, those.high, these.flat, those.flat)
 
-    straight = _meeting(these.offset, those.offset, these.flat, those.flat)
-    corners, lost = _root(misses, straight, these, those, graph)
+    def misses(z, foot, lean, graph):
+        height, slope = graph.at(foot + z * lean)
+        return z - height, 1 - jnp.sum(slope * lean, axis=0)
+
+    z, lost = _root(misses, jnp.zeros_like(these.high), foot, lean, graph)
+    corners = foot + z * lean
     first, last = corners[:, :-1], corners[:, 1:]
     turn = first[0] * last[1] - first[1] * last[0]
-    share, weights = _gauss(_nodes(graph), 0)
-    ends = jnp.concatenate([first + x * (last - first) for x in share], axis=1)
-    again = jax.tree.map(lambda a: jnp.concatenate([a[..., 1:, :]] * len(share), axis=-2), these)
-    found, reach = _along_ways(again, graph, ends, jnp.concatenate([w * turn for w in weights]))
+    share, weights = (
+        np.array(a, turn.dtype).reshape(-1, *(1,) * turn.ndim) for a in _gauss(_nodes(graph), 0)
+    )
+    ends = first[:, None] + share * (last - first)[:, None]
+    again = jax.tree.map(lambda a: a[..., 1:, :], these)
+    found, reach = _along_ways(again, graph, ends, weights * turn)
     far = jnp.sum(jax.lax.stop_gradient(corners) ** 2, axis=0)
     far = jnp.where(jnp.any(lost, axis=0), jnp.inf, far)
     return found, jnp.maximum(jnp.max(far, axis=0), reach)
@@ -136,37 +137,42 @@ def _along_ways(sides: Sides, graph: Expansion, ends, measure):
     That is infinite where the surface bends so much within the cell that a side is not found.
 
     Args:
-        ends: of the ways if the sides were straight.
-        measure: what each stands for then.
+        ends: of the ways if the sides were straight, one or several to each side, `(t, w, r, *p)`.
+        measure: what each stands for then, `(w, r, *p)`.
     """
     degree, nodes = graph.degree, _nodes(graph)
 
-    def misses(length, sides, graph, ends):
-        q = length * ends
-        beyond, slope = sides.miss(q, *graph.at(q))
-        rate = jnp.sum(slope * ends, axis=0)
-        return (beyond,), lambda beyond: beyond / jnp.where(rate > 0, rate, 1)
-
-    length, lost = _root(misses, jnp.ones_like(measure), sides, graph, ends)
-    ends = length * ends
-    measure = measure * length**graph.dim
-
-    # Along a way each monomial is a power.
+    # Along a way each monomial is a power, and so is what is missed of the side.
     rows = monomials_by_degree(ends, degree)
+    heights = [sides.high * polynomial([c], [row]) for c, row in zip(graph.heights, rows[1:])]
+    heights[0] = heights[0] + jnp.sum(ends * sides.flat[:, None], axis=0)
+
+    def misses(length, offset, heights):
+        beyond, rate = heights[-1], jnp.zeros_like(length)
+        for height in [*heights[-2::-1], -offset]:
+            beyond, rate = beyond * length + height, rate * length + beyond
+        return beyond, rate
+
+    length, lost = _root(misses, jnp.ones_like(measure), sides.offset, heights)
+    lengths = [jnp.ones_like(length)]
+    for _ in range(degree):
+        lengths.append(lengths[-1] * length)
+    measure = measure * lengths[graph.dim]
+
     at, share = (np.array(a, length.dtype) for a in _gauss(nodes, graph.dim - 1))
     powers = at ** np.arange(degree + 1)[:, None].astype(length.dtype)
     square = jnp.ones((nodes, *length.shape), length.dtype)
     for slope in graph.slopes:
-        along = jnp.stack([polynomial([c], [row]) for c, row in zip(slope, rows)])
-        square = square + jnp.tensordot(powers[:-1].T, along, 1) ** 2
-    sums = jnp.tensordot(powers * share, jnp.sqrt(square), 1) * measure
-    found = [jnp.sum(row * total, axis=1) for row, total in zip(rows, sums)]
-    length, ends = jax.lax.stop_gradient((length, ends))
+        along = [s * polynomial([c], [row]) for s, c, row in zip(lengths, slope, rows)]
+        square = square + jnp.tensordot(powers[:-1].T, jnp.stack(along), 1) ** 2
+    sums = jnp.tensordot(powers * share, jnp.sqrt(square), 1) * measure * jnp.stack(lengths)
+    found = [jnp.sum(row * total, axis=(1, 2)) for row, total in zip(rows, sums)]
+    length, ends = jax.lax.stop_gradient((length, length * ends))
     resolved = (length > 0) & (length < _STRETCH) & ~lost
     reach = jnp.where(resolved, jnp.sum(ends**2, axis=0), jnp.inf)
     # The line of a border passes through the point: there is nothing between them.
     reach = jnp.where(sides.offset > 0, reach, 0)
-    return jnp.concatenate(found), jnp.max(reach, axis=0)
+    return jnp.concatenate(found), jnp.max(reach, axis=(0, 1))
 
 
 def _nodes(graph: Expansion) -> int:
@@ -250,16 +256,14 @@ def _root(misses: Callable, start, *known):
     """Where what is missed vanishes, by Newton's method, and whether that was lost: then the start.
 
     Args:
-        misses: of x and what is known: a tuple of what is missed there, and a function that
-            divides such a tuple by its slope in x.
+        misses: of x and what is known: what is missed there, and its slope in x.
 
     Differentiable: in what is known, to any order, by the implicit function theorem.
     """
 
     def step(state):
         count, x, moved, _ = state
-        missed, divided = misses(x, *known)
-        new = x - divided(*missed)
+        new = x - _divided(*misses(x, *known))
         return count + 1, new, jnp.max(jnp.abs(new - x)), moved
 
     # One step more than to one that is small.
@@ -275,9 +279,14 @@ def _root_jvp(misses, primals, tangents):
     (start, *known), (_, *moved) = primals, tangents
     x, lost = _root(misses, start, *known)
     x = checkpoint_name(x, KEPT)
-    divided = misses(x, *known)[1]
+    slope = misses(x, *known)[1]
     _, missed = jax.jvp(lambda *known: misses(x, *known)[0], known, moved)
-    return (x, lost), (-divided(*missed), np.zeros(lost.shape, jax.dtypes.float0))
+    return (x, lost), (-_divided(missed, slope), np.zeros(lost.shape, jax.dtypes.float0))
+
+
+def _divided(missed, slope):
+    """A step of Newton's method, where the slope is that of a surface that faces the point."""
+    return missed / jnp.where(slope > 0, slope, 1)
 
 
 @functools.cache

@@ -45,9 +45,8 @@ def moments(v, eta):
 
 def symmetric(gram, a):
     """The symmetric matrix of a system times a vector over the basis."""
-    if isinstance(gram, list):
-        return [_total(g * a_j for g, a_j in zip(row, a)) for row in gram]
-    return jnp.einsum("mn...,nc...->mc...", gram, a)
+    a = jnp.stack(a) if isinstance(a, list) else a
+    return (gram[:, :, None] * a[:, None]).sum(axis=0)
 
 
 def transform(matrix: np.ndarray, a):
@@ -81,19 +80,18 @@ def factor(gram):
     moment is dependent on the others (a flat surface with few normal copies, say); one step of
     refinement on the unshifted matrix takes the effect of the shift away again.
     """
-    small = isinstance(gram, list)
-    a = jnp.stack([jnp.stack(row) for row in gram]) if small else gram
-    diagonal = _diagonal(a)
-    rsqrt = jax.lax.rsqrt if namespace(a) is jnp else lambda x: 1 / np.sqrt(x)
-    scale = rsqrt(namespace(a).where(diagonal > 0, diagonal, 1))
-    a = a * scale * scale[:, None]
+    rsqrt = jax.lax.rsqrt if namespace(gram) is jnp else lambda x: 1 / np.sqrt(x)
+    diagonal = _diagonal(gram)
+    scale = rsqrt(namespace(gram).where(diagonal > 0, diagonal, 1))
+    a = gram * scale * scale[:, None]
     shift = 4 * len(a) * jnp.finfo(a.dtype).eps
-    solve_scaled, pivot = (_by_columns if small or _in_columns(a) else _by_lapack)(a, shift)
+    solve_scaled, pivot = (_by_columns if _in_columns(a) else _by_lapack)(a, shift)
 
     def solve(b, refined=True):
-        b = (jnp.stack(b) if small else b) * scale[:, None]
+        rows = isinstance(b, list)
+        b = (jnp.stack(b) if rows else b) * scale[:, None]
         x = solve_scaled(b, refined) * scale[:, None]
-        return list(x) if small else x
+        return list(x) if rows else x
 
     xp = namespace(pivot)
     return solve, (xp.max(pivot, axis=0) / xp.min(pivot, axis=0)) ** 2
@@ -124,7 +122,7 @@ def _by_columns(a, shift):
         return jax.lax.fori_loop(0, m, backward, jnp.zeros_like(b))
 
     def times(x):
-        return jnp.sum(a[:, :, None] * x[:, None], axis=0)
+        return symmetric(a, x)
 
     def solution(_, b):
         refine = lambda _, x: x + substitute(b - times(x))

@@ -225,8 +225,10 @@ def _places(dim: int, low: int, high: int) -> np.ndarray:
 def gram_matrix(x, w, low, high):
     """The matrix A, each moment summed once."""
     if _is_small(x, low, high):
-        sums = jnp.stack([jnp.sum(row, axis=0) for row in monomial_rows(x, 2 * high, w)])
-        return sums[_places(len(x), low, high)]
+        sums = [jnp.sum(row, axis=0) for row in monomial_rows(x, 2 * high, w)]
+        # Slower than this was to gather from their stack.
+        places = _places(len(x), low, high).tolist()
+        return jnp.stack([jnp.stack([sums[i] for i in row]) for row in places])
     # Moments as one small matrix product: monomials in all coordinates but the last, times
     # powers of the last.
     powers, xp = monomials(x[-1:], 2 * high), namespace(x)

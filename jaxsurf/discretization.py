@@ -198,7 +198,7 @@ class Discretization(eqx.Module):
         Accuracy: error $O(h^{p+1})$ with p the degree of the method (the order, for DC-PSE), one
         order more for even p on even points; $O(h^2)$ where the surface has a border
         (`tests/test_discretization.py`).
-        Differentiable: once, forward and reverse, in points and normals.
+        Differentiable: forward and reverse, in points and normals; in reverse once.
         Raises:
             ValueError: the cell of a point is not closed by its neighbours (named by index), as
                 on a border that is not marked.

@@ -29,6 +29,8 @@ from .plane import TangentPlane
 _SMALL, _STEPS = 1e-4, 8
 # Sides that it puts so much farther out than straight ones, or behind the point, are not found.
 _STRETCH = 2.0
+# Nor are roots so far away, in units of the kernel or of the straight way.
+_LOST = 1e3
 # Of the neighbours that are tried so many are its sides at most, or half of them.
 _SIDES = 16
 
@@ -126,8 +128,9 @@ def _over_sides(these: Sides, those: Sides, graph: Expansion):
     ends = first[:, None] + share * (last - first)[:, None]
     again = jax.tree.map(lambda a: a[..., 1:, :], these)
     found, reach = _along_ways(again, graph, ends, weights * turn)
-    far = jnp.sum(jax.lax.stop_gradient(corners) ** 2, axis=0)
-    far = jnp.where(jnp.any(lost, axis=0), jnp.inf, far)
+    foot, corners = jax.lax.stop_gradient((foot, corners))
+    lost = lost | jnp.any(jnp.abs(corners - foot) > _STRETCH * (1 + jnp.abs(foot)), axis=0)
+    far = jnp.where(lost, jnp.inf, jnp.sum(corners**2, axis=0))
     return found, jnp.maximum(jnp.max(far, axis=0), reach)
 
 
@@ -270,7 +273,7 @@ def _root(misses: Callable, start, *known):
     moves = lambda state: (state[0] < _STEPS) & ~(state[3] < _SMALL)
     infinite = jnp.asarray(jnp.inf, start.dtype)
     x = jax.lax.while_loop(moves, step, (0, start, infinite, infinite))[1]
-    lost = ~(jnp.abs(x - start) < _STRETCH * (1 + jnp.abs(start)))
+    lost = ~(jnp.abs(x - start) < _LOST)
     return jnp.where(lost, start, x), lost
 
 

@@ -30,6 +30,7 @@ from .design.functionals import chamfer_distance as chamfer_distance
 from .design.functionals import moments as moments
 from .design.functionals import signed_distance as signed_distance
 from .design.functionals import volume as volume
+from .design.functionals import willmore_energy as willmore_energy
 from .design.harmonics import spherical_harmonics as spherical_harmonics
 from .design.harmonics import star_shape as star_shape
 from .design.level_sets import LevelSetShape as LevelSetShape

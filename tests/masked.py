@@ -350,7 +350,13 @@ def thinned(c: Case):
 def measured(c: Case):
     targets = np.array([[1.5, 0.0, 0.2], [0.0, -1.2, 0.4]])
     s, u = c.surface, c.u
-    numbers = js.volume(s), js.moments(s), js.compliance(s, u), js.chamfer_distance(s, targets)
+    numbers = (
+        js.volume(s),
+        js.willmore_energy(s),
+        js.moments(s),
+        js.compliance(s, u),
+        js.chamfer_distance(s, targets),
+    )
     values = js.eigenvalues(s, 4)
     own = c.cloud.points[c.rows[:5]] * jnp.array([1.0, 1.02, 0.98])
     radii = js.medial_radius(s)[c.rows]
@@ -585,7 +591,8 @@ BESIDE = {
     "SurfaceDiffusionFlow": "evolve", "WillmoreFlow": "evolve", "Redistribution": "evolve",
     "Evolution": "evolve", "Adaptation": "adapt_points", "Adapted": "adapt_points",
     "Contact": "evolve",
-    "moments": "volume", "compliance": "volume", "eigenvalues": "volume",
+    "willmore_energy": "volume", "moments": "volume",
+    "compliance": "volume", "eigenvalues": "volume",
     "chamfer_distance": "volume", "tangent_point_energy": "volume", "medial_radius": "volume",
     "signed_distance": "volume",
 }  # fmt: skip

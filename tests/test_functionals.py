@@ -62,6 +62,23 @@ def test_values_and_shape_derivatives_on_the_torus():
     assert (slopes[:, [0, 1, 4, 5]] > 4.8).all() and (slopes > 3.3).all(), slopes
 
 
+def test_the_willmore_energy_on_the_torus():
+    """Value and derivative in both radii; as the plain integral where neighbours are too few."""
+
+    def errors(n):
+        radii = jnp.array([R, r])
+        value, slopes = jax.value_and_grad(lambda a: js.willmore_energy(torus(n, a)))(radii)
+        wanted, right = jax.value_and_grad(lambda a: exact(a)[3])(radii)
+        return np.array([abs(value / wanted - 1), np.linalg.norm(slopes / right - 1)])
+
+    coarse, fine = errors(500), errors(2_000)
+    assert (fine < [2e-6, 4e-5]).all(), fine
+    assert (np.log2(coarse / fine) > 4.8).all(), coarse / fine
+    cloud = reference(500).cloud
+    few = js.discretize(cloud, js.find_neighbors(cloud, k=40), method=js.GFDM(degree=4))
+    assert js.willmore_energy(few) == few.integrate(few.mean_curvature**2)
+
+
 @functools.cache
 def ball():
     return js.discretize(js.sphere(400), method=js.GFDM(degree=2))
@@ -84,7 +101,8 @@ def test_derivatives_in_the_geometry():
         centroid, second = js.moments(surface)
         values = [js.volume(surface), second[0, 1] + second[0, 0], centroid[2]]
         values += [js.chamfer_distance(surface, targets), js.compliance(surface, load)]
-        return jnp.stack(values) @ jnp.array([1.0, -0.7, 2.0, 3.0, -1.0])
+        values += [js.willmore_energy(surface)]
+        return jnp.stack(values) @ jnp.array([1.0, -0.7, 2.0, 3.0, -1.0, 0.8])
 
     axes, direction = jnp.array([1.0, 0.9, 0.8]), jnp.array([0.3, -0.2, 0.4])
     # So short that no point changes the target nearest to it: the chamfer distance has kinks there
@@ -214,12 +232,13 @@ def test_curves_compiled_mapped_and_in_single_precision():
         near = js.chamfer_distance(moved, jnp.array([[0.0, 3.0]], jnp.float32))
         load = cloud.points[:, 0]
         work = js.compliance(moved, load)
-        return jnp.stack([js.volume(moved), js.moments(moved)[1][0, 0], near, work])
+        bending = js.willmore_energy(moved)
+        return jnp.stack([js.volume(moved), js.moments(moved)[1][0, 0], near, work, bending])
 
     radii = jnp.array([1.0, 2.0], jnp.float32)
     found, pi = values(radii), np.pi
     assert found.dtype == jnp.float32
     a = np.array([1.0, 2.0])
     near = a**2 + 9 + (3 - a) ** 2
-    wanted = np.stack([pi * a**2, pi * a**3, near, pi * a**3], axis=1)
+    wanted = np.stack([pi * a**2, pi * a**3, near, pi * a**3, 2 * pi / a], axis=1)
     np.testing.assert_allclose(found, wanted, rtol=1e-2)

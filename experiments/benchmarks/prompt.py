@@ -237,6 +237,7 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
         lambda m: js.adapt_points(m.surface, js.Adaptation(0.05 * m.number), m.u).fields,
     ),
     "volume": ("closed", "surface", lambda m: js.volume(m.surface)),
+    "willmore_energy": ("closed", "surface", lambda m: js.willmore_energy(m.surface)),
     "moments": ("closed", "surface", lambda m: js.moments(m.surface)),
     "eigenvalues": ("closed", "surface", lambda m: js.eigenvalues(m.surface, 6)),
     "compliance": ("closed", "surface", lambda m: js.compliance(m.surface, m.u)),

@@ -1,10 +1,9 @@
 r"""Numbers that belong to a shape: functions of a discretisation, differentiable in its geometry.
 
 Many are a line with what a discretisation has already, and have no name here: the area
-`surface.areas.sum()`, the total mean curvature `surface.integrate(surface.mean_curvature)`, the
-Willmore energy `surface.integrate(surface.mean_curvature**2)`, and a heat content is
-`surface.inner(w, u)` with u from `js.integrate`. Users' own are functions of a discretisation too.
-Those that are energies, eigenvalues and compliance, are in `energies.py`.
+`surface.areas.sum()`, the total mean curvature `surface.integrate(surface.mean_curvature)`, and a
+heat content is `surface.inner(w, u)` with u from `js.integrate`. Users' own are functions of a
+discretisation too. Those that are energies, eigenvalues and compliance, are in `energies.py`.
 """
 
 from __future__ import annotations
@@ -19,13 +18,18 @@ from jaxtyping import Array, Float, Int
 from ..arguments import as_float, finite, instance, switched_off
 from ..build import determined, residual_tolerance
 from ..compiling import sized_jit
+from ..curvature import mean_curvature
 from ..discretization import Discretization
 from ..failures import is_concrete, refuse, without_derivatives
+from ..fits.monomials import polynomial_count
 from ..frames import frames_of
 from ..functions import constant
 from ..interpolation import beyond, distance_and_reach, nearest_points, read_from
 from ..motion import crossed
+from ..stencils.gfdm import GFDM
 
+# Neighbours for each unknown, without which polynomials of a higher degree are no better.
+_ENOUGH = 2.5
 # Steps that lead to a foot, in the first of which the local polynomial is that of the point of the
 # cloud next to it.
 _STEPS, _FOLLOWED = 40, 10
@@ -53,6 +57,44 @@ def volume(surface: Discretization) -> Float[Array, ""]:
     x, normals = surface.cloud.seen.points, surface.cloud.seen.normals
     height = jnp.sum((x - surface.mean(stop_gradient(x))) * normals, axis=1)
     return surface.integrate(height) / surface.cloud.dim
+
+
+def willmore_energy(surface: Discretization) -> Float[Array, ""]:
+    r"""Willmore energy $\int_S H^2\,dS$, that of bending: $4\pi$ on spheres.
+
+    Of a curve the integral of its squared curvature.
+
+    With H of higher order than `surface.mean_curvature`. Curvature is a first derivative of the
+    normals, and to these polynomials of even degree are no better on even points than those of
+    the odd degree below: H comes from `GFDM` of the degree of the method, or one more if that is
+    even, and there are neighbours for it (2.5 for each unknown; else as the method has it).
+
+    Args:
+        surface: from `js.discretize`.
+
+    Accuracy: errors of value and derivative are $O(h^{p+1})$ with p that degree, or those of
+        `surface.integrate`: with `js.GFDM(degree=4)` 1e-6 and 2.4e-5 on 2,000 points of a torus, a
+        hundredth and a seventh of those of $H^2$ integrated
+        (`tests/test_functionals.py::test_the_willmore_energy_on_the_torus`). In float32 as
+        `volume`.
+    Differentiable: forward and reverse, in points and normals.
+    Raises:
+        TypeError: what is no discretisation.
+        ValueError: as `surface.areas` and `js.mean_curvature`.
+    Source: Willmore 1965; as the energy of bending Helfrich 1973.
+
+    Example:
+        >>> surface = js.discretize(js.sphere(500), method=js.GFDM(degree=4))
+        >>> bool(abs(js.willmore_energy(surface) - 4 * jnp.pi) < 1e-4)
+        True
+    """
+    instance(surface, Discretization, "surface", "js.discretize(cloud) makes one")
+    cloud, neighbors, degree = surface.cloud, surface.neighbors, surface.method.polynomial_degree
+    odd = degree + 1 - degree % 2
+    unknowns = polynomial_count(cloud.dim - 1, odd) - 1
+    if neighbors.k < _ENOUGH * unknowns:
+        return surface.integrate(surface.mean_curvature**2)
+    return surface.integrate(mean_curvature(cloud, neighbors, method=GFDM(degree=odd)) ** 2)
 
 
 def moments(surface: Discretization) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:

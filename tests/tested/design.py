@@ -61,6 +61,14 @@ TESTED = {
         "float32": _CURVES,
         "bad input": "malformed",
     },
+    "willmore_energy": {
+        "value": _FUN + "test_the_willmore_energy_on_the_torus",
+        "gradient": _MOVED,
+        "jit": _CURVES,
+        "vmap": _CURVES,
+        "float32": _CURVES,
+        "bad input": "malformed",
+    },
     "moments": {
         "value": _FUN + "test_values_and_shape_derivatives_on_the_torus",
         "gradient": _MOVED,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax
-import numpy as np
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..compiling import AnyArray, namespace
@@ -95,12 +95,19 @@ def _width(degree: int) -> float:
 
 def dot(a: Float[AnyArray, "k d *p"], b: Float[AnyArray, "#k d *p"]) -> Float[AnyArray, "k *p"]:
     """Scalar products; written out, as sums over an axis between others are slow."""
-    first, *more = (x * y for x, y in zip(_along_axes(a), _along_axes(b)))
+    return _dot(a, b) if namespace(a) is jnp else _written_out(a, b)
+
+
+def _written_out(a, b):
+    first, *more = (a[:, i] * b[:, i] for i in range(a.shape[1]))
     return sum(more, first)
 
 
-def _along_axes(a):
-    if namespace(a) is np:
-        return a.swapaxes(0, 1)
-    # As slices each would have a derivative as large as all of them.
-    return [x[:, 0] for x in jax.lax.split(a, (1,) * a.shape[1], axis=1)]
+_dot = jax.custom_jvp(_written_out)
+
+
+@_dot.defjvp
+def _dot_jvp(primals, tangents):
+    # As a sum, which transposed is one product for all axes.
+    (a, b), (da, db) = primals, tangents
+    return _dot(a, b), jnp.sum(da * b + a * db, axis=1)

@@ -115,6 +115,7 @@ CALLS = [
     ("signed_distance", "one point", lambda: js.signed_distance(surface(), X), ("points", "(3,)")),
     ("signed_distance", "a point that is not finite", lambda: js.signed_distance(surface(), X[None] * jnp.nan), ("points", "point 0")),
     ("medial_radius", "nothing", lambda: js.medial_radius(None), ("surface is None", "Discretization")),
+    ("willmore_energy", "points", lambda: js.willmore_energy(surface().cloud.points), ("surface", "Discretization")),
     ("volume", "a border", lambda: js.volume(cap()), ("border", "closed")),
     ("eigenvalues", "a border", lambda: js.eigenvalues(cap(), 4), ("border", "closed")),
     ("eigenvalues", "more than there are", lambda: js.eigenvalues(surface(), 41), ("k = 41", "n / 2 = 40")),

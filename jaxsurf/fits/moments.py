@@ -214,21 +214,14 @@ def _gather_table(dim: int, low: int, high: int) -> tuple[np.ndarray, np.ndarray
     return rows.astype(np.int32), total[..., -1].astype(np.int32)
 
 
-@functools.cache
-def _places(dim: int, low: int, high: int) -> np.ndarray:
-    """Where the moment of multi-index beta + gamma stands among all up to twice the degree."""
-    basis, place = multi_indices(dim, low, high), position(dim, 2 * high)
-    total = (basis[:, None] + basis).tolist()
-    return np.array([[place[tuple(g)] for g in row] for row in total], np.int32)
-
-
 def gram_matrix(x, w, low, high):
     """The matrix A, each moment summed once."""
     if _is_small(x, low, high):
         sums = [jnp.sum(row, axis=0) for row in monomial_rows(x, 2 * high, w)]
         # Slower than this was to gather from their stack.
-        places = _places(len(x), low, high).tolist()
-        return jnp.stack([jnp.stack([sums[i] for i in row]) for row in places])
+        basis, place = multi_indices(len(x), low, high), position(len(x), 2 * high)
+        total = (basis[:, None] + basis).tolist()
+        return jnp.stack([jnp.stack([sums[place[tuple(g)]] for g in row]) for row in total])
     # Moments as one small matrix product: monomials in all coordinates but the last, times
     # powers of the last.
     powers, xp = monomials(x[-1:], 2 * high), namespace(x)

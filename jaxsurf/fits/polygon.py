@@ -74,14 +74,10 @@ def moments_over(sides: Sides, graph: Graph, ways):
 
     The latter squared.
     """
-    size = polynomial_count(graph.dim, graph.degree)
-    return _moments_over(sides, graph.by_degree(), ways, size)
-
-
-def _moments_over(sides: Sides, graph: Expansion, ways, size: int):
+    by_degree = graph.by_degree()
     if graph.dim == 1:
         ends, measure, which = ways
-        found, reach = _along_ways(sides.chosen(which), graph, ends[:, None], measure[None])
+        found, reach = _along_ways(sides.chosen(which), by_degree, ends[:, None], measure[None])
         # The nearest to either side bound a curve's cell, if it is found at all.
         return found, jnp.where(reach < jnp.inf, 0, reach)
     side, still = ways
@@ -95,9 +91,10 @@ def _moments_over(sides: Sides, graph: Expansion, ways, size: int):
     def half(these):
         side, after, ended = these
         none = jnp.zeros((size, *side.shape[1:]), sides.offset.dtype)
-        of_sides = lambda: _over_sides(sides.chosen(side), sides.chosen(after), graph)
+        of_sides = lambda: _over_sides(sides.chosen(side), sides.chosen(after), by_degree)
         return jax.lax.cond(ended, lambda: (none, none[0]), of_sides)
 
+    size = polynomial_count(graph.dim, graph.degree)
     found, reach = blockwise(half, (side[halves], after[halves], jnp.stack(ended)))
     return jnp.sum(found, axis=0), jnp.max(reach, axis=0)
 
@@ -109,7 +106,6 @@ def _over_sides(these: Sides, those: Sides, graph: Expansion):
         these: sides in turn, of which the first is that before.
         those: what cuts each of them off.
     """
-
     # The planes of two sides meet in a line, which leans by so much over the plane.
     foot = _meeting(these.offset, those.offset, these.flat, those.flat)
     lean = -_meeting(these.high, those.high, these.flat, those.flat)

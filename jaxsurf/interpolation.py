@@ -113,7 +113,7 @@ def _of_blocks(blocks, count, degree: int):
         place = jnp.sum(plane.tangents * offset, axis=1) / plane.width
         wanted = monomials(place, degree)[1:, None]
         eta, _, residual = moment_solve(plane.points, plane.weights, wanted, 1, degree)
-        return jnp.where(around.mask, with_center(eta, 1)[0], 0), residual
+        return jnp.where(around.mask, with_center(eta)[0].at[0].add(1), 0), residual
 
     return blockwise(weights, blocks, count)
 

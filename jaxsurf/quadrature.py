@@ -248,7 +248,7 @@ def _weights_of_blocks(planes, mask, moments, degree: int):
         # The fit knows differences from the point itself: the constant is the area times its value.
         eta, _, residual = moment_solve(plane.points, plane.weights, moments[1:, None], 1, degree)
         area = jnp.where(mask[0], unit * moments[0], 0)
-        eta = with_center(unit * eta, area)[0]
+        eta = with_center(unit * eta)[0].at[0].add(area)
         return jnp.where(mask, eta, 0), residual
 
     return blockwise(weights, (planes, mask, moments))

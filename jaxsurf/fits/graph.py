@@ -6,6 +6,7 @@ import functools
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .monomials import differentiation, monomials_by_degree, polynomial_count
@@ -33,9 +34,11 @@ class Graph(eqx.Module):
         """Its coefficients and those of its slopes, degree by degree."""
         last = [polynomial_count(self.dim, g) for g in range(self.degree + 1)]
         heights = jnp.split(self.coefficients, [count - 1 for count in last[1:-1]])
-        matrices = differentiation(self.dim, self.degree)[:, : last[-2], 1:]
-        every = jnp.tensordot(matrices.astype(self.coefficients.dtype), self.coefficients, 1)
-        slopes = [jnp.split(slope, last[:-2]) for slope in every]
+        parts = [slice(start, stop) for start, stop in zip([0, *last], last[:-1])]
+        matrices = differentiation(self.dim, self.degree)[:, :, 1:]
+        slopes = [
+            [_places(matrix[part], self.coefficients) for part in parts] for matrix in matrices
+        ]
         return Expansion(heights, slopes, self.degree)
 
 
@@ -68,3 +71,9 @@ def polynomial(coefficients: list[Array], rows: list[Array]) -> Array:
     shaped = lambda c, row: c.reshape(len(c), *(1,) * (row.ndim - c.ndim), *c.shape[1:])
     parts = [jnp.sum(shaped(c, row) * row, axis=0) for c, row in zip(coefficients, rows)]
     return functools.reduce(jnp.add, parts)
+
+
+def _places(matrix: np.ndarray, a):
+    """A matrix with one entry in a row times a vector over the basis."""
+    power = matrix.max(axis=1).reshape(-1, *(1,) * (a.ndim - 1)).astype(a.dtype)
+    return a[matrix.argmax(axis=1)] * power

@@ -8,10 +8,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
-
-from .systems import KEPT
 
 
 def taper(s: Float[Array, "*q"]) -> Float[Array, "*q"]:
@@ -64,23 +61,24 @@ def support(
     """
     if radius is None:
         target = _SHARE * _MEAN_WEIGHT[dim] * jnp.sum(mask, axis=0)
-        # The point itself counts, also in rows that are switched off.
-        return _filled(r2, mask.at[0].set(True), jnp.maximum(target, 1.2))
+        return _soft_radius(r2, mask, jnp.maximum(target, 1.2), dim)
     return jnp.broadcast_to(jnp.asarray(radius, r2.dtype), r2.shape[1:])
 
 
-@jax.custom_jvp
-def _filled(r2, mask, target):
-    """The radius where the weights `_counted` add up to the target.
+def _soft_radius(r2, mask, target, dim):
+    # The point itself counts, also in rows that are switched off.
+    return jnp.exp(_log_radius(r2, mask.at[0].set(True), target))
 
-    Derivatives, of any order, in r2.
-    """
+
+@jax.custom_jvp
+def _log_radius(r2, mask, target):
+    """Where the weights `_counted` add up to the target; derivatives, of any order, in r2."""
 
     def newton(state):
         # In an even set log(count) is a straight line in t = log(radius), nearly; where a step
         # leaves the bracket, it is halved instead.
         low, high, t, _, steps = state
-        value, slope = _counted(r2, mask, jnp.exp(t))
+        value, slope = _counted(r2, mask, t)
         low, high = jnp.where(value < target, t, low), jnp.where(value < target, high, t)
         step = t + jnp.log(target / value) * value / jnp.maximum(slope, 1e-3 * value)
         inside = (step >= low) & (step <= high)
@@ -97,24 +95,25 @@ def _filled(r2, mask, target):
     start = 0.5 * jnp.log(jnp.where(mean > 0, 2 * _SHARE * mean, 1))
     infinite = jnp.asarray(jnp.inf, r2.dtype)
     t = jax.lax.while_loop(moving, newton, (start - 5, start + 5, start, infinite, 0))[2]
-    value, slope = _counted(r2, mask, jnp.exp(t))
-    return jnp.exp(t + (target - value) / jnp.maximum(slope, 1e-3))
+    value, slope = _counted(r2, mask, t)
+    return t + (target - value) / jnp.maximum(slope, 1e-3)
 
 
-@_filled.defjvp
-def _filled_jvp(primals, tangents):
+@_log_radius.defjvp
+def _log_radius_jvp(primals, tangents):
     # The implicit function theorem; the target is a number of points.
     r2, mask, target = primals
-    radius = checkpoint_name(_filled(r2, mask, target), KEPT)
-    _, slope = _counted(r2, mask, radius)
-    s = jnp.minimum(r2 * radius**-2, 1)
-    lost = jnp.sum(jnp.where(mask, 3 * (1 - s) ** 2 * tangents[0], 0), axis=0) / radius
-    return radius, lost / jnp.maximum(slope, 1e-3)
+    t = _log_radius(r2, mask, target)
+    _, slope = _counted(r2, mask, t)
+    unit = jnp.exp(-2 * t)
+    s = jnp.minimum(r2 * unit, 1)
+    lost = jnp.sum(jnp.where(mask, 3 * (1 - s) ** 2 * tangents[0], 0), axis=0) * unit
+    return t, lost / jnp.maximum(slope, 1e-3)
 
 
-def _counted(r2, mask, radius):
-    """The weights $(1 - s)^3$ of all points, $s = r^2 / R^2$, and their derivative in log R."""
-    s = jnp.minimum(r2 * radius**-2, 1)
+def _counted(r2, mask, t):
+    """The weights $(1 - s)^3$ of all points, $s = r^2 / e^{2t}$, and their derivative in t."""
+    s = jnp.minimum(r2 * jnp.exp(-2 * t), 1)
     count = jnp.sum(jnp.where(mask, (1 - s) ** 3, 0), axis=0)
     return count, jnp.sum(jnp.where(mask, 6 * s * (1 - s) ** 2, 0), axis=0)
 

@@ -36,6 +36,9 @@ from .monomials import (
     position,
 )
 
+# The name of what is worth storing until derivatives need it: short, and long to compute.
+KEPT = "kept"
+
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
 def moment_solve(
@@ -71,7 +74,7 @@ def _solve(x, w, b, low, high):
     small = isinstance(v, list)
     b = b.astype(w.dtype).reshape(*b.shape, *(1,) * (w.ndim + 1 - b.ndim))
     wanted = list(b) if small else jnp.broadcast_to(b, (*b.shape[:2], *w.shape[1:]))
-    a = systems.kept(solve(wanted))
+    a = solve(wanted)
     s = systems.combine(a, v[start:])
     eta = w * s
     # The moments of eta are A a.
@@ -160,7 +163,6 @@ def _polynomial_fit_jvp(low, high, primals, tangents):
     x, w, values = primals
     dx, dw, dz = tangents
     (out, condition), (v, start, solve) = _fit(x, w, values, low, high)
-    out = systems.kept(out)
     dx = _columns(dx, v, w)
     a = list(out) if isinstance(v, list) else out
     left = systems.stored(values - systems.combine(a, v[start:]), v, w)
@@ -267,7 +269,7 @@ def blockwise(f: Callable, blocks, count=None):
         count: only so many of them, may be traced; not differentiable then. None: all.
     """
     if count is None:
-        kept = jax.checkpoint_policies.save_only_these_names(systems.KEPT)
+        kept = jax.checkpoint_policies.save_only_these_names(KEPT)
         return jax.lax.map(jax.checkpoint(f, policy=kept), blocks)
     f = jax.jit(f)  # traced once
     at, put_at = jax.lax.dynamic_index_in_dim, jax.lax.dynamic_update_index_in_dim

@@ -59,8 +59,8 @@ def monomials(x: Float[AnyArray, "dim *q"], high: int) -> Float[AnyArray, "m *q"
 def monomials_by_degree(x: Float[AnyArray, "dim *q"], high: int) -> list[Float[AnyArray, "_ *q"]]:
     """The same with each degree apart."""
     dim, xp = len(x), namespace(x)
-    degrees = [xp.ones_like(x[:1]), x][: high + 1]
-    for degree in range(2, high + 1):
+    degrees = [xp.ones_like(x[:1])]
+    for degree in range(1, high + 1):
         # Those that begin with x_a are x_a times the lower ones in x_a and the coordinates after
         # it, which stand last.
         lower = degrees[-1]

@@ -19,10 +19,9 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
 from .graph import Expansion, Graph, polynomial
-from .moments import blockwise
+from .moments import KEPT, blockwise
 from .monomials import monomials_by_degree, polynomial_count
 from .plane import TangentPlane
-from .systems import KEPT
 
 # Newton steps from cells with straight sides to those on the surface end with the one after one as
 # small as this, or after so many: each squares what is left of an error of the size
@@ -195,20 +194,10 @@ def ways_of(sides: Sides):
     return (side, following == side[0]), jnp.where(closed, jnp.max(away, axis=0), -1)
 
 
-@jax.custom_jvp
 def _meeting(u, v, a, b):
     r"""Where two lines meet, those of $q\cdot a = u$ and of $q\cdot b = v$."""
     size = a[0] * b[1] - a[1] * b[0]
     return jnp.stack([b[1] * u - a[1] * v, a[0] * v - b[0] * u]) / jnp.where(size == 0, 1, size)
-
-
-@_meeting.defjvp
-def _meeting_jvp(primals, tangents):
-    # As of every linear system. Derivatives of the formula are many, one for each coordinate.
-    (u, v, a, b), (du, dv, da, db) = primals, tangents
-    q = _meeting(u, v, a, b)
-    du, dv = du - jnp.sum(q * da, axis=0), dv - jnp.sum(q * db, axis=0)
-    return q, _meeting(du, dv, a, b)
 
 
 def _round(flat, offset, on):

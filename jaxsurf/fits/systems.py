@@ -16,13 +16,10 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.ad_checkpoint import checkpoint_name
 
 from ..compiling import is_quick, namespace
 from ..machine import machine
 
-# The name of what is worth storing until derivatives need it: short, and long to compute.
-KEPT = "kept"
 # Columns of a factor between two passes over the matrix.
 _TOGETHER = 8
 
@@ -76,12 +73,6 @@ def stored(x, v, w):
     return jax.lax.cond(~(w[0, 0] < 0), lambda x: x, jnp.zeros_like, x)
 
 
-def kept(a):
-    """What belongs to a small system, stored for derivatives, which then do not find it again."""
-    traced = isinstance(a, list) or namespace(a) is jnp
-    return checkpoint_name(a, KEPT) if traced and is_small(len(a)) else a
-
-
 def factor(gram):
     """A solver for the equilibrated symmetric matrix, and its condition estimate.
 
@@ -91,8 +82,8 @@ def factor(gram):
     """
     rsqrt = jax.lax.rsqrt if namespace(gram) is jnp else lambda x: 1 / np.sqrt(x)
     diagonal = _diagonal(gram)
-    scale = kept(rsqrt(namespace(gram).where(diagonal > 0, diagonal, 1)))
-    a = kept(gram * scale * scale[:, None])
+    scale = rsqrt(namespace(gram).where(diagonal > 0, diagonal, 1))
+    a = gram * scale * scale[:, None]
     shift = 4 * len(a) * jnp.finfo(a.dtype).eps
     solve_scaled, pivot = (_by_columns if _in_columns(a) else _by_lapack)(a, shift)
 
@@ -114,7 +105,7 @@ def _in_columns(a) -> bool:
 
 def _by_columns(a, shift):
     """Cholesky's factor and its inverse column by column, for all points at once."""
-    m, columns = len(a), kept(_cholesky(a, shift))
+    m, columns = len(a), _cholesky(a, shift)
     pivot = _diagonal(columns)
 
     def substitute(b):

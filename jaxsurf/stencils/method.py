@@ -7,7 +7,6 @@ import abc
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..arguments import as_float, real, whole
@@ -227,8 +226,6 @@ def needed_polynomials(degree: int, dim: int, target: AbstractTarget) -> int:
     return polynomial_count(dim - 1, degree)
 
 
-def with_center(eta: Float[Array, "c k *p"], total=0) -> Float[Array, "c k *p"]:
-    """Weights with a given sum: those of the neighbours as given, the centre's made up."""
-    # Not set in place: that is a program of its own, and its derivative several.
-    center = np.arange(eta.shape[1]).reshape(-1, *(1,) * (eta.ndim - 2)) == 0
-    return jnp.where(center, total + eta[:, :1] - jnp.sum(eta, axis=1, keepdims=True), eta)
+def with_center(eta: Float[Array, "c k *p"]) -> Float[Array, "c k *p"]:
+    """Weights that sum to zero: those of the neighbours as given, the centre's made up."""
+    return eta.at[:, 0].set(-jnp.sum(eta[:, 1:], axis=1))

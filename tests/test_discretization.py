@@ -203,7 +203,7 @@ def test_integrals_on_points_at_random():
     [(data.bunny, 3_000, 20), (data.spot, 3_000, 2), (data.armadillo, 10_000, 86)],
 )
 def test_few_cells_of_scans_are_not_closed(scan, n, most):
-    """Those at folds, which neighbours behind the surface cannot close: 18, 1 and 78, a tenth more may be rounded so."""
+    """Those at folds: 18, 1 and 78 of them, and a tenth more where rounding is another."""
     try:
         surface = js.discretize(scan(n))
     except FileNotFoundError as absent:

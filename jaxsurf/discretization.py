@@ -201,7 +201,7 @@ class Discretization(eqx.Module):
         Differentiable: forward and reverse, in points and normals; in reverse once.
         Raises:
             ValueError: the cell of a point is not closed by its neighbours (named by index), as
-                on a border that is not marked.
+                on a border that is not marked, or in a fold of a scan (see `cell_areas`).
         """
         return quadrature.areas(*self._bounds)
 

@@ -69,7 +69,8 @@ def areas(
     text = (
         "the neighbours of point {i} do not close its cell, out of {v} of them: mark the "
         "border of the surface (`boundary`), or, where there is none, take more neighbours, "
-        f"js.discretize(cloud, js.find_neighbors(cloud, k={more}))"
+        f"js.discretize(cloud, js.find_neighbors(cloud, k={more})); in folds of a scan that is of "
+        "no use, but surface.cell_areas @ u integrates to second order"
     )
     bad, count = _open(closed, neighbors.mask)
     found = refuse(_summed(weights, neighbors.indices), bad, text, count)

@@ -214,6 +214,8 @@ def test_few_cells_of_scans_are_not_closed(scan, n, most):
     open_ = [re.search(r"the cells of (\d+) points", str(one.message)) for one in told]
     assert sum(int(found[1]) for found in open_ if found) <= most
     assert float(sizes.min()) > 0
+    with pytest.raises(ValueError, match=r"in folds of a scan .* surface\.cell_areas @ u"):
+        surface.integrate(jnp.ones(n))
 
 
 @pytest.mark.filterwarnings("ignore:the surface bends")

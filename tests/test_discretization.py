@@ -1,5 +1,6 @@
 """`js.discretize`: operators kept, integrals of high order, interpolation, moved surfaces."""
 
+import contextlib
 import re
 import warnings
 
@@ -203,7 +204,10 @@ def test_integrals_on_points_at_random():
     [(data.bunny, 3_000, 20), (data.spot, 3_000, 2), (data.armadillo, 10_000, 86)],
 )
 def test_few_cells_of_scans_are_not_closed(scan, n, most):
-    """Those at folds: 18, 1 and 78 of them, and a tenth more where rounding is another."""
+    """Those at folds: 18, 1 and 78 of them; one or a tenth more where rounding is another.
+
+    Integrals are refused where there are some, and only there.
+    """
     try:
         surface = js.discretize(scan(n))
     except FileNotFoundError as absent:
@@ -211,10 +215,12 @@ def test_few_cells_of_scans_are_not_closed(scan, n, most):
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         sizes = surface.cell_areas
-    open_ = [re.search(r"the cells of (\d+) points", str(one.message)) for one in told]
-    assert sum(int(found[1]) for found in open_ if found) <= most
+    counts = [re.search(r"the cells of (\d+) points", str(one.message)) for one in told]
+    count = sum(int(found[1]) for found in counts if found)
+    assert count <= most
     assert float(sizes.min()) > 0
-    with pytest.raises(ValueError, match=r"in folds of a scan .* surface\.cell_areas @ u"):
+    named = pytest.raises(ValueError, match=r"in folds of a scan .* surface\.cell_areas @ u")
+    with named if count else contextlib.nullcontext():
         surface.integrate(jnp.ones(n))
 
 

@@ -153,8 +153,10 @@ def _fit(x, w, values, low, high):
     a = solve(systems.moments(basis, w * values), refined=False)
     # Refined by the residual: squaring the condition number costs digits, many in float32.
     left = systems.stored(w * (values - systems.combine(a, basis)), v, w)
-    a = systems.add(a, solve(systems.moments(basis, left), refined=False))
-    return (jnp.stack(a) if isinstance(a, list) else a, condition), (v, start, solve)
+    more = solve(systems.moments(basis, left), refined=False)
+    if isinstance(a, list):
+        a, more = jnp.stack(a), jnp.stack(more)
+    return (a + more, condition), (v, start, solve)
 
 
 @_polynomial_fit.defjvp

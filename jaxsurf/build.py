@@ -322,10 +322,10 @@ def _report(poor, best, border, chosen, method) -> None:
     if failed.any():
         worst = np.flatnonzero(failed)[np.argmin(best[failed])]
         warn(
-            f"no neighbourhood of {failed.sum()} points serves {method}: the worst is point "
-            f"{poor[worst]}, where the centre has a share of {best[worst]:.2g} of the weights "
-            f"among the {chosen[worst]} nearest, {method.least_dominance} is needed; the operator "
-            "may have growing modes (js.spectral_estimate)"
+            f"for {failed.sum()} points no size of neighbourhood serves {method}: the worst is "
+            f"point {poor[worst]}, where the centre has a share of {best[worst]:.2g} of the "
+            f"weights among the {chosen[worst]} nearest, {method.least_dominance} is needed; the "
+            "operator may have growing modes (js.spectral_estimate)"
         )
 
 

@@ -202,14 +202,16 @@ def run(
         neighbors = _lists(laplacian)
         closure = _held_at_border(cloud)
     with stage("spectrum"):
-        spectrum = spectral_estimate(_at_rest_on_border(laplacian))
+        at_rest = _at_rest_on_border(laplacian)
+        spectrum = spectral_estimate(at_rest)
     with stage("curvature"):
         curvature = jax.block_until_ready(_curvature(cloud, neighbors, method))
     with stage("heat"):
         areas = cell_areas(cloud, neighbors)
         source = central_point(surface)
         start = spot(cloud, source, surface.size / 16)
-        heat = Heat.within(until or _rounded(surface.size**2 / 100), float(spectrum.radius))
+        end = until or _rounded(surface.size**2 / 100)
+        heat = Heat.within(end, at_rest, float(spectrum.radius))
         probe = _probe(cloud, source, float(np.sqrt(2 * heat.until)))
         # One program for heat, gradient and difference: another takes longer to compile than it
         # saves.

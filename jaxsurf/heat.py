@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import diffrax
@@ -15,8 +16,10 @@ from .cloud import PointCloud
 from .frames import tangent_frames
 from .neighbors import Neighbors
 from .stencils.stencil import Stencil
+from .time.amplification import amplification_of
 from .time.explicit import RKC2
 from .time.integrate import integrate
+from .time.stability import check_steps
 from .time.transport import AdvectionDiffusionReaction
 
 
@@ -62,9 +65,34 @@ class Heat(NamedTuple):
     radius: float
 
     @staticmethod
-    def within(until: float, radius: float) -> Heat:
-        """Steps short enough for a hot spot; what else stability asks for, RKC2's stages give."""
-        return Heat(until, _STEPS, (0.0, until / 5, until), _MARGIN * radius)
+    def within(until: float, laplacian: Stencil, radius: float) -> Heat:
+        """Steps short enough for a hot spot, and stable as `integrate` asks for.
+
+        What the radius asks for RKC2's stages give; on coarse scans there may be eigenvalues beside
+        the real axis too, for which steps have to be shorter.
+
+        Args:
+            until: the end.
+            laplacian: what is stepped, at rest where borders are held.
+            radius: an estimate of its spectral radius.
+
+        Raises:
+            ValueError: no steps are stable.
+        """
+        radius *= _MARGIN
+        step, dt = amplification_of(RKC2(spectral_radius=radius)), until / _STEPS
+        assert step is not None
+        zero, u = jnp.zeros(()), jnp.zeros(laplacian.n, laplacian.weights.dtype)
+        look = eqx.filter_jit(check_steps)
+        found = look(step, (lambda t, u, args: laplacian(u),), zero, u, None, dt, until, False)
+        steps = _STEPS
+        if not found.stable:
+            longest, _ = found.longest(step, dt, until)
+            if not longest:
+                raise ValueError(f"RKC2 is stable for no step, the spectral radius is {radius:.3g}")
+            # A little shorter, as surfaces are moved a little; the frames lie between steps.
+            steps = 5 * math.ceil(until / (5 * 0.9 * longest))
+        return Heat(until, steps, (0.0, until / 5, until), radius)
 
 
 # The spectral radius is estimated from below.

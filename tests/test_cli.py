@@ -13,7 +13,7 @@ import jaxsurf as js
 from jaxsurf import demo
 from jaxsurf.cli import main
 from jaxsurf.formats.by_suffix import contents_of
-from jaxsurf.heat import cell_areas
+from jaxsurf.heat import Heat, cell_areas, diffuse, spot
 
 _DATA = Path("../shared/data")
 
@@ -112,6 +112,22 @@ def test_surface_from_file(tmp_path):
     cloud = js.sphere(300)
     js.write(tmp_path / "points.xyz", cloud)
     assert demo.surface_from_file(tmp_path / "points.xyz", 100).cloud.n == 300
+
+
+def test_heat_takes_shorter_steps_for_eigenvalues_beside_the_real_axis():
+    """Coarse scans have some: 40 steps, as many as the radius asks for, were refused."""
+    surface = js.discretize(js.circle(60), method=js.GFDM(degree=2))
+    plain, x, start = surface.laplacian, surface.cloud.points, spot(surface.cloud, 0, 0.5)
+    around = jnp.stack([-x[:, 1], x[:, 0]])
+    turning = jnp.sum(surface.gradient.weights * around, axis=1)
+    skew = plain.of_weights(plain.weights + 10 * turning)
+    for laplacian, steps in ((plain, (40, 40)), (skew, (41, 60))):
+        heat = Heat.within(1.0, laplacian, js.spectral_estimate(laplacian).radius)
+        assert steps[0] <= heat.steps <= steps[1]
+        peaks = jnp.max(jnp.abs(diffuse(laplacian, None, start, heat)), axis=1)
+        assert peaks[2] < peaks[1] < peaks[0] == 1
+    with pytest.raises(ValueError, match="is unstable"):
+        diffuse(skew, None, start, heat._replace(steps=40))
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -525,7 +525,8 @@ def test_partial_derivatives_in_other_forms():
 def test_where_no_neighbourhood_serves():
     """Points on two close circles: no size gives the centre a share, and the user is told."""
     cloud = js.sphere(14)
-    with pytest.warns(UserWarning, match=r"no neighbourhood of \d+ points serves _Flat.*point \d+"):
+    text = r"for \d+ points no size of neighbourhood serves _Flat.*point \d+"
+    with pytest.warns(UserWarning, match=text):
         js.choose_neighbors(cloud, method=_Flat())
 
 

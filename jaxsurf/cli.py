@@ -44,10 +44,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.surface is None:
             return demo.built_in_surface(10_000 if options.points is None else options.points)
         points = 10_000 if options.points is None else options.points
-        return demo.surface_from_file(options.surface, None if points == "all" else points)
+        return demo.surface_from_file(
+            options.surface,
+            None if points == "all" else points,
+            smooth=not options.flat,
+            largest_part=options.largest_part,
+        )
 
-    if options.points == "all" and options.surface is None:
-        parser.error("--points all needs --surface")
+    needing = {"points all": options.points == "all", "flat": options.flat}
+    for name, on in (needing | {"largest-part": options.largest_part}).items():
+        if on and options.surface is None:
+            parser.error(f"--{name} needs --surface")
     try:
         with _progress(len(demo.STAGES)) as tell:
             result = demo.run(
@@ -86,6 +93,17 @@ def _parser() -> argparse.ArgumentParser:
         metavar="N",
         help="sample the surface evenly with N points (default: 10000), or 'all' for the "
         "vertices of the file as they are",
+    )
+    one.add_argument(
+        "--flat",
+        action="store_true",
+        help="keep to the triangles, in place of a smooth surface through the vertices "
+        "(smooth=False of js.read)",
+    )
+    one.add_argument(
+        "--largest-part",
+        action="store_true",
+        help="leave out triangles until no edge has more than two (largest_part=True of js.read)",
     )
     one.add_argument(
         "--out",

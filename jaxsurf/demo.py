@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.spatial import cKDTree
 
 from .boundary import Closure
 from .cloud import PointCloud
@@ -82,14 +83,21 @@ def _thickened(cloud: PointCloud, thickness: float | Float[Array, ""]) -> PointC
     return PointCloud(points, level_set_normals(phi, points))
 
 
-def surface_from_file(path: str | Path, n: int | None = 10_000) -> Surface:
+def surface_from_file(
+    path: str | Path,
+    n: int | None = 10_000,
+    *,
+    smooth: bool = True,
+    largest_part: bool = False,
+) -> Surface:
     """A mesh resampled to n points, or a file's own points (n None, or no triangles in it).
 
-    What `read` converts it states in warnings. The size of the whole varies.
+    The rest is for `read`, which states in warnings what it converts. The size of the whole varies.
     """
     has_triangles = bool(contents_of(path).faces)
-    cloud = read(path, n=n if has_triangles else None)
-    own = "its own points" if n is None or not has_triangles else "resampled evenly"
+    n = n if has_triangles else None
+    cloud = read(path, n=n, smooth=smooth, largest_part=largest_part)
+    own = "its own points" if n is None else "resampled evenly"
     moved = jax.tree_util.Partial(_scaled, cloud)
     # Scans are usually stored with y up.
     up, view = (0.0, 1.0, 0.0), (0.5, 0.5, 1.7)
@@ -102,13 +110,18 @@ def _scaled(cloud: PointCloud, scale: float | Float[Array, ""]) -> PointCloud:
 
 
 def central_point(surface: Surface) -> int:
-    """The point in the middle of the picture."""
+    """The point in the middle of the picture, of those away from the border, which is held."""
+    border = surface.cloud.boundary
     points = np.asarray(surface.cloud.points)
     points = points - points.mean(axis=0)
     view = np.resize(surface.view, points.shape[1])
     height = points @ view / np.linalg.norm(view)
     aside = np.sqrt(np.maximum(np.sum(points**2, axis=1) - height**2, 0))
-    return int(np.argmax(height - 3 * aside))
+    central = height - 3 * aside
+    if border is not None and border.any():
+        away = cKDTree(points[np.asarray(border)]).query(points)[0]
+        central = np.where(away >= min(surface.size / 3, away.max()), central, -np.inf)
+    return int(np.argmax(central))
 
 
 # --- the whole -----------------------------------------------------------------------------
@@ -219,7 +232,13 @@ def run(
         at = lambda value: _with_gradient(
             value, start, surface.moved, neighbors, method, closure, heat, jnp.asarray(probe)
         )
-        (_, temperature), (gradient, sensitivity) = at(value)
+        try:
+            (_, temperature), (gradient, sensitivity) = at(value)
+        except eqx.EquinoxRuntimeError:
+            raise ValueError(
+                "the heat grows without bound: eigenvalues of the operator have real parts up to "
+                f"{float(spectrum.abscissa):.3g}. {'; '.join(notes)}"
+            ) from None
         step = 1e-4 * value
         above, below = (at(value + h)[0][0] for h in (step, -step))
         difference = (above - below) / (2 * step)

@@ -24,6 +24,7 @@ from .neighbors import Neighbors, Rows, nearest_of
 from .stencils.gfdm import GFDM
 from .stencils.method import AbstractMethod, power_mean, ramp
 from .stencils.targets import Gradient
+from .stencils.usual import USUAL
 
 
 def eliminate(
@@ -31,7 +32,7 @@ def eliminate(
     conditions: Condition | Sequence[Condition],
     *,
     neighbors: Neighbors | None = None,
-    method: AbstractMethod = GFDM(degree=2),
+    method: AbstractMethod | None = None,
     border: Border | None = None,
     throw: bool = True,
 ) -> Closure:
@@ -50,7 +51,8 @@ def eliminate(
         neighbors: lists for all n points, of which the free ones are used; if None, the
             nearest free points are searched for (host only).
         method: how the derivatives are computed; of the operator's order or one above. GFDM
-            serves DC-PSE operators too.
+            serves DC-PSE operators too. If None that of a surface; for a cloud `GFDM(degree=4)`, in
+            float32, whose round-off that amplifies too much, `GFDM(degree=2)`.
         border: from `find_border`, for conormals on traced points; found where needed if None.
         throw: check stencils and pivots (on concrete arrays).
 
@@ -83,9 +85,12 @@ def eliminate(
     if isinstance(cloud, Discretization):
         neighbors = cloud.neighbors if neighbors is None else neighbors
         border = cloud.border if border is None else border
+        method = cloud.method if method is None else method
         cloud = cloud.cloud
+    if method is None:
+        method = USUAL if jnp.finfo(cloud.points.dtype).bits > 32 else GFDM(degree=2)
     conditions, owner = checked_conditions(cloud, conditions)
-    instance(method, AbstractMethod, "method", "as js.GFDM(degree=2)")
+    instance(method, AbstractMethod, "method", "as js.GFDM(degree=4)")
     check_parts(cloud, neighbors, border)
     free, declared = cloud.host_active.copy(), np.zeros(cloud.n, bool)
     for condition in conditions:

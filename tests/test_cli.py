@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -142,6 +143,45 @@ def test_cell_areas(dim):
     assert abs(moment - 1 / dim) < 1e-3
 
 
+def test_meshes_of_few_triangles_are_taken_as_they_are(tmp_path, capsys):
+    """The eight corners of a box allow no smooth fit; a wall that stands on it is left out."""
+    corners = [f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+    sides = "1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"
+    box = "".join([*corners, *(f"f {side}\n" for side in sides)])
+    path = tmp_path / "box.obj"
+    path.write_text(box)
+    code, _, err = run(capsys, "--surface", path, "--out", tmp_path)
+    assert code == 2 and "at least 17" in err
+    assert demo.surface_from_file(path, 500, smooth=False).cloud.n == 500
+    path.write_text(box + "v 0 0 -1\nf 1 3 9\n")
+    options = "--surface", path, "--points", 600, "--flat", "--out", tmp_path
+    code, _, err = run(capsys, *options)
+    assert code == 2 and "largest_part" in err
+    code, report, _ = run(capsys, *options, "--largest-part")
+    assert "points           600" in report and "dropped, so that no edge" in report
+
+
+def test_the_spot_keeps_away_from_a_border():
+    """The middle of the picture of an open cylinder is on its rim, where temperatures are held."""
+    bowl = lambda s: (1 + 0 * s, s)
+    cloud = js.surface_of_revolution(bowl, 600)
+    surface = demo.Surface(cloud, "a tube", ("scale", 1.0), lambda value: cloud)
+    held = np.asarray(cloud.points)[np.asarray(cloud.boundary)]
+    away = np.linalg.norm(np.asarray(cloud.points)[:, None] - held, axis=2).min(axis=1)
+    here = away[demo.central_point(surface)]
+    assert here >= min(surface.size / 3, away.max()) > 0.3
+
+
+def test_heat_without_bound_is_one_line(tmp_path, monkeypatch, capsys):
+    def grows(*arguments):
+        raise eqx.EquinoxRuntimeError("what runs within jit ends with")
+
+    monkeypatch.setattr(demo, "_with_gradient", grows)
+    code, out, err = run(capsys, "--points", 600, "--out", tmp_path)
+    *_, error = err.splitlines()
+    assert code == 2 and out == "" and "eigenvalues of the operator have real parts up to" in error
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [
@@ -171,7 +211,8 @@ def test_bad_input_is_one_line(arguments, words, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     "arguments",
     [[], ["dance"], ["demo", "--points", "many"], ["demo", "--points", "-5"],
-     ["demo", "--method", "fem"], ["demo", "--points", "all"]],
+     ["demo", "--method", "fem"], ["demo", "--points", "all"], ["demo", "--flat"],
+     ["demo", "--largest-part"]],
 )  # fmt: skip
 def test_bad_arguments(arguments, capsys):
     with pytest.raises(SystemExit) as stop:

@@ -215,7 +215,8 @@ def _subspace(system: _System, k: int, degenerate: float, *, left: bool) -> Subs
         if mean < 0:
             raise ValueError(
                 f"the eigenvalues of the operator have the mean {-mean:.3g}, expected one below 0, "
-                "as of a Laplacian: modes are those of minus it. Give -operator"
+                "as of a Laplacian: modes are those of minus it. Give -operator, if it is not a "
+                "Laplacian with growing modes (js.spectral_estimate)"
             )
         space = invariant.subspace(matrix, reference[free].astype(float), k, degenerate, left=left)
         return _spread(space, free, n, reference.dtype)

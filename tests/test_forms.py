@@ -146,7 +146,9 @@ def closed(points, _, near):
     normals = jnp.stack([-0.3 * points[:, 1], -0.3 * points[:, 0], 1 + 0 * points[:, 0]], axis=1)
     normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
     cloud = js.PointCloud(bent, normals, boundary=BORDERED.boundary)
-    closure = js.eliminate(cloud, js.neumann(BORDERED.boundary), neighbors=near, border=BORDER)
+    # Of the degree that is usual in either precision.
+    options = dict(neighbors=near, border=BORDER, method=js.GFDM(degree=2))
+    closure = js.eliminate(cloud, js.neumann(BORDERED.boundary), **options)
     return closure(jnp.sin(bent @ jnp.asarray([1.0, 2.0, 1.5], points.dtype)))
 
 

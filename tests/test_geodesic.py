@@ -37,6 +37,23 @@ def test_coarse_points():
         assert relative_error(distance, exact_on_sphere(cloud, source)) < bound
 
 
+def test_borders_and_random_points():
+    """Ten times less accurate than on even points without a border, and no better with more."""
+    tube = js.surface_of_revolution(lambda s: (1 + 0 * s, 2 * s), 2_000)
+    angle = jnp.arctan2(tube.points[:, 1], tube.points[:, 0])
+    for height, bound in ((1.0, 2e-2), (0.0, 5e-2)):
+        source = jnp.argmin((tube.points[:, 2] - height) ** 2 + angle**2)[None]
+        turn = jnp.abs(angle - angle[source])
+        turn = jnp.minimum(turn, 2 * jnp.pi - turn)
+        exact = jnp.hypot(turn, tube.points[:, 2] - tube.points[source, 2])
+        assert relative_error(js.geodesic_distance(tube, source), exact) < bound
+    points = np.random.default_rng(0).normal(size=(2_000, 3))
+    points = jnp.asarray(points / np.linalg.norm(points, axis=1)[:, None])
+    random, source = js.PointCloud(points, points), jnp.array([0])
+    distance = js.geodesic_distance(random, source)
+    assert relative_error(distance, exact_on_sphere(random, source)) < 3e-2
+
+
 def test_first_order_where_fronts_meet():
     def error(n):
         cloud = js.sphere(n)

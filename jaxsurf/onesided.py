@@ -51,8 +51,8 @@ def eliminate(
         neighbors: lists for all n points, of which the free ones are used; if None, the
             nearest free points are searched for (host only).
         method: how the derivatives are computed; of the operator's order or one above. GFDM
-            serves DC-PSE operators too. If None that of a surface; for a cloud `GFDM(degree=4)`, in
-            float32, whose round-off that amplifies too much, `GFDM(degree=2)`.
+            serves DC-PSE operators too. If None that of a surface, or `GFDM(degree=4)`; in float32,
+            whose round-off that amplifies too much, `GFDM(degree=2)`.
         border: from `find_border`, for conormals on traced points; found where needed if None.
         throw: check stencils and pivots (on concrete arrays).
 
@@ -85,10 +85,11 @@ def eliminate(
     if isinstance(cloud, Discretization):
         neighbors = cloud.neighbors if neighbors is None else neighbors
         border = cloud.border if border is None else border
-        method = cloud.method if method is None else method
-        cloud = cloud.cloud
+        usual, cloud = cloud.method, cloud.cloud
+    else:
+        usual = USUAL
     if method is None:
-        method = USUAL if jnp.finfo(cloud.points.dtype).bits > 32 else GFDM(degree=2)
+        method = usual if jnp.finfo(cloud.points.dtype).bits > 32 else GFDM(degree=2)
     conditions, owner = checked_conditions(cloud, conditions)
     instance(method, AbstractMethod, "method", "as js.GFDM(degree=4)")
     check_parts(cloud, neighbors, border)

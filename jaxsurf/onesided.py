@@ -88,9 +88,9 @@ def eliminate(
         usual, cloud = cloud.method, cloud.cloud
     else:
         usual = USUAL
+    conditions, owner = checked_conditions(cloud, conditions)
     if method is None:
         method = usual if jnp.finfo(cloud.points.dtype).bits > 32 else GFDM(degree=2)
-    conditions, owner = checked_conditions(cloud, conditions)
     instance(method, AbstractMethod, "method", "as js.GFDM(degree=4)")
     check_parts(cloud, neighbors, border)
     free, declared = cloud.host_active.copy(), np.zeros(cloud.n, bool)

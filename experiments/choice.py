@@ -115,10 +115,10 @@ def _heat_lost(cloud: js.PointCloud, laplacian: js.Stencil, held, radius: float)
     closure, border = None, cloud.boundary
     if border is not None and border.any():
         closure = js.eliminate(cloud, js.dirichlet(border, jnp.zeros(int(border.sum()))))
+    heat = Heat.within(float(size**2 / 100), held, radius)
     try:
-        heat = Heat.within(float(size**2 / 100), held, radius)
         temperature = diffuse(laplacian, closure, start, heat)
-    except (js.IntegrationError, ValueError):  # it grows
+    except js.IntegrationError:  # it grows
         return np.inf
     first, *_, last = np.asarray(temperature @ areas)
     return abs(float(last / first) - 1)

@@ -51,10 +51,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             largest_part=options.largest_part,
         )
 
-    needing = {"points all": options.points == "all", "flat": options.flat}
-    for name, on in (needing | {"largest-part": options.largest_part}).items():
-        if on and options.surface is None:
-            parser.error(f"--{name} needs --surface")
+    of_files = {
+        "--points all": options.points == "all",
+        "--flat": options.flat,
+        "--largest-part": options.largest_part,
+    }
+    for option, given in of_files.items():
+        if given and options.surface is None:
+            parser.error(f"{option} needs --surface")
     try:
         with _progress(len(demo.STAGES)) as tell:
             result = demo.run(

@@ -234,11 +234,11 @@ def run(
         )
         try:
             (_, temperature), (gradient, sensitivity) = at(value)
-        except eqx.EquinoxRuntimeError:
+        except eqx.EquinoxRuntimeError as error:
             raise ValueError(
-                "the heat grows without bound: eigenvalues of the operator have real parts up to "
-                f"{float(spectrum.abscissa):.3g}. {'; '.join(notes)}"
-            ) from None
+                f"heat cannot be followed to t = {end:g}: eigenvalues of the operator have real "
+                f"parts up to {float(spectrum.abscissa):.3g}. {'; '.join(notes)}"
+            ) from error
         step = 1e-4 * value
         above, below = (at(value + h)[0][0] for h in (step, -step))
         difference = (above - below) / (2 * step)

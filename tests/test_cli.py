@@ -157,14 +157,13 @@ def test_meshes_of_few_triangles_are_taken_as_they_are(tmp_path, capsys):
     options = "--surface", path, "--points", 600, "--flat", "--out", tmp_path
     code, _, err = run(capsys, *options)
     assert code == 2 and "largest_part" in err
-    code, report, _ = run(capsys, *options, "--largest-part")
+    _, report, _ = run(capsys, *options, "--largest-part")
     assert "points           600" in report and "dropped, so that no edge" in report
 
 
 def test_the_spot_keeps_away_from_a_border():
     """The middle of the picture of an open cylinder is on its rim, where temperatures are held."""
-    bowl = lambda s: (1 + 0 * s, s)
-    cloud = js.surface_of_revolution(bowl, 600)
+    cloud = js.surface_of_revolution(lambda s: (1 + 0 * s, s), 600)
     surface = demo.Surface(cloud, "a tube", ("scale", 1.0), lambda value: cloud)
     held = np.asarray(cloud.points)[np.asarray(cloud.boundary)]
     away = np.linalg.norm(np.asarray(cloud.points)[:, None] - held, axis=2).min(axis=1)

@@ -38,7 +38,7 @@ def test_coarse_points():
 
 
 def test_borders_and_random_points():
-    """Ten times less accurate than on even points without a border, and no better with more."""
+    """Several times less accurate than on even points without a border."""
     tube = js.surface_of_revolution(lambda s: (1 + 0 * s, 2 * s), 2_000)
     angle = jnp.arctan2(tube.points[:, 1], tube.points[:, 0])
     for height, bound in ((1.0, 2e-2), (0.0, 5e-2)):

@@ -21,7 +21,6 @@ from .discretization import Discretization
 from .failures import is_concrete, needs_values, raise_at
 from .fits.kernels import gaussian
 from .neighbors import Neighbors, Rows, nearest_of
-from .stencils.gfdm import GFDM
 from .stencils.method import AbstractMethod, power_mean, ramp
 from .stencils.targets import Gradient
 from .stencils.usual import USUAL
@@ -51,8 +50,7 @@ def eliminate(
         neighbors: lists for all n points, of which the free ones are used; if None, the
             nearest free points are searched for (host only).
         method: how the derivatives are computed; of the operator's order or one above. GFDM
-            serves DC-PSE operators too. If None that of a surface, or `GFDM(degree=4)`; in float32,
-            whose round-off that amplifies too much, `GFDM(degree=2)`.
+            serves DC-PSE operators too. If None that of a surface, or `GFDM(degree=4)`.
         border: from `find_border`, for conormals on traced points; found where needed if None.
         throw: check stencils and pivots (on concrete arrays).
 
@@ -63,7 +61,7 @@ def eliminate(
         error of a screened Poisson problem with flux conditions on a spherical cap of 1,600
         points: 1.6e-3 GFDM(2), 1.5e-5 GFDM(4), 6e-4 DCPSE(2) closed by GFDM(3), 1.3e-5 DCPSE(4)
         closed by GFDM(4), with the orders of the operators (`tests/test_boundary.py`). In float32
-        filled values are within 2e-5, gradients in the points within 1 %
+        filled values are within 2e-5, by degree 4 within 1e-4, gradients in the points within 1 %
         (`tests/test_boundary.py`, `tests/test_forms.py`).
     Differentiable: forward and reverse, in points, normals, values, a, b and conormals, for
     fixed neighbours.
@@ -85,12 +83,10 @@ def eliminate(
     if isinstance(cloud, Discretization):
         neighbors = cloud.neighbors if neighbors is None else neighbors
         border = cloud.border if border is None else border
-        usual, cloud = cloud.method, cloud.cloud
-    else:
-        usual = USUAL
+        method = cloud.method if method is None else method
+        cloud = cloud.cloud
     conditions, owner = checked_conditions(cloud, conditions)
-    if method is None:
-        method = usual if jnp.finfo(cloud.points.dtype).bits > 32 else GFDM(degree=2)
+    method = USUAL if method is None else method
     instance(method, AbstractMethod, "method", "as js.GFDM(degree=4)")
     check_parts(cloud, neighbors, border)
     free, declared = cloud.host_active.copy(), np.zeros(cloud.n, bool)
@@ -137,8 +133,7 @@ def without_flux(surface: Discretization) -> Closure | None:
     Returns:
         The closure; None of a surface without border.
 
-    Accuracy: as `eliminate`; in float32 filled values are within 2e-5, those of degree 4 within
-        5e-4 (`tests/test_boundary.py`).
+    Accuracy: as `eliminate`, in float32 too (`tests/test_boundary.py`).
     Differentiable: forward and reverse, in points and normals, for fixed neighbours.
     Raises:
         TypeError: no surface.

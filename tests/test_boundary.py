@@ -482,16 +482,28 @@ def test_a_closure_is_of_the_degree_of_its_surface():
         np.testing.assert_array_equal(mine, js.eliminate(surface, flux, method=by(degree))(u))
     plain = js.eliminate(cloud, flux)(u)
     np.testing.assert_array_equal(plain, js.eliminate(cloud, flux, method=by(4))(u))
-    # Round-off of single precision is amplified too much by degree 4 on one side.
-    single = jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == float else a, cloud)
-    surface = js.discretize(cloud)
-    mine = js.eliminate(js.discretize(single, surface.neighbors), flux)(u.astype(jnp.float32))
-    low = js.eliminate(surface, flux, method=by(2))(u)
-    np.testing.assert_allclose(mine, low, atol=1e-4)
 
 
-@pytest.mark.parametrize(("method", "single"), [(js.DCPSE(order=2), 2e-5), (js.GFDM(4), 5e-4)])
-def test_a_surface_without_flux_is_closed_as_by_a_condition(method, single):
+@pytest.mark.parametrize("corners", [False, True])
+def test_degree_4_on_borders_in_single_precision(corners):
+    """The moments of one-sided stencils were met to 1e-2 there, which is an error."""
+    bent = lambda x, y: 0.2 * jnp.sin(3 * x) * y
+    cloud = js.graph(bent, (12, 12)) if corners else cap(400)
+    narrow = lambda t: jax.tree.map(lambda a: a.astype("float32") if a.dtype == float else a, t)
+    double = js.discretize(cloud, method=js.GFDM(degree=4))
+    single = js.discretize(narrow(cloud), narrow(double.neighbors), method=js.GFDM(degree=4))
+    u = jnp.cos(2 * cloud.points[:, 0])
+    flux = js.neumann(cloud.boundary)
+    for fill in (js.without_flux, lambda surface: js.eliminate(surface, flux)):
+        np.testing.assert_allclose(fill(single)(narrow(u)), fill(double)(u), atol=2e-5)
+    scale = jnp.abs(double.laplacian(u)).max()
+    np.testing.assert_allclose(
+        single.laplacian(narrow(u)) / scale, double.laplacian(u) / scale, atol=1e-3
+    )
+
+
+@pytest.mark.parametrize("method", [js.DCPSE(order=2), js.GFDM(degree=4)])
+def test_a_surface_without_flux_is_closed_as_by_a_condition(method):
     """By the same neighbours; also of traced points, in single precision, and differentiated."""
     cloud = cap(400)
     surface = js.discretize(cloud, method=method)
@@ -509,7 +521,7 @@ def test_a_surface_without_flux_is_closed_as_by_a_condition(method, single):
     np.testing.assert_allclose(traced(cloud.points, u, surface), named(u), atol=1e-12)
     narrow = lambda a: a.astype("float32") if a.dtype == float else a
     found = traced(narrow(cloud.points), narrow(u), jax.tree.map(narrow, surface))
-    np.testing.assert_allclose(found, named(u), atol=single)
+    np.testing.assert_allclose(found, named(u), atol=2e-5)
     both = jnp.stack([cloud.points, 1.1 * cloud.points])
     mapped = jax.vmap(lambda x: traced(x, u, surface))(both)
     np.testing.assert_allclose(mapped, jnp.stack([named(u)] * 2), atol=1e-9)
@@ -601,11 +613,12 @@ def test_single_precision():
     np.testing.assert_allclose(nu, js.border_conormals(SMALL), atol=1e-5)
     where = np.asarray(SMALL.boundary)
     conditions = js.robin(where, FLUX, a=0.5, b=1.0)
-    closure = js.eliminate(single, conditions)
-    filled = closure(U.astype(jnp.float32))
-    assert filled.dtype == closure.weights.dtype == closure.offset().dtype == jnp.float32
-    double = js.eliminate(SMALL, conditions, method=js.GFDM(degree=2))
-    np.testing.assert_allclose(filled, double(U), atol=2e-5)
+    for method, bound in ((js.GFDM(degree=2), 2e-5), (js.GFDM(degree=4), 1e-4)):
+        closure = js.eliminate(single, conditions, method=method)
+        filled = closure(U.astype(jnp.float32))
+        assert filled.dtype == closure.weights.dtype == closure.offset().dtype == jnp.float32
+        double = js.eliminate(SMALL, conditions, method=method)
+        np.testing.assert_allclose(filled, double(U), atol=bound)
     images_of = functools.partial(js.with_ghosts, conditions=conditions, method=js.DCPSE(order=2))
     wide, images = images_of(single)
     exact_cloud, exact = images_of(SMALL)

@@ -38,6 +38,8 @@ from .monomials import (
 
 # The name of what is worth storing until derivatives need it: short, and long to compute.
 KEPT = "kept"
+# In single precision weights are corrected until moments are met to this, so many times at most.
+_SINGLE, _ROUNDS = 3e-5, 8
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
@@ -76,12 +78,34 @@ def _solve(x, w, b, low, high):
     wanted = list(b) if small else jnp.broadcast_to(b, (*b.shape[:2], *w.shape[1:]))
     a = solve(wanted)
     s = systems.combine(a, v[start:])
-    eta = w * s
-    # The moments of eta are A a.
-    error = jnp.abs(systems.symmetric(gram, a) - b)
     size = jnp.max(jnp.abs(b), axis=(0, 1))
-    residual = jnp.max(error, axis=(0, 1)) / jnp.where(size > 0, size, 1)
-    return (eta, condition, residual), (v, start, solve, a, s)
+    size = jnp.where(size > 0, size, 1)
+    relative = lambda left: jnp.max(jnp.abs(left), axis=(0, 1)) / size
+    if jnp.finfo(w.dtype).bits > 32:
+        residual = relative(systems.symmetric(gram, a) - b)  # the moments of eta are A a
+    else:
+        a, s, residual = _corrected(a, s, wanted, w, v[start:], solve, relative)
+    return (w * s, condition, residual), (v, start, solve, a, s)
+
+
+def _corrected(a, s, wanted, w, basis, solve, relative):
+    """Weights corrected by the moments that they have: in single precision those of A a are others.
+
+    As often as a neighbourhood on one side takes: three times on a border, eight at a corner.
+    """
+
+    def corrected(state):
+        a, s, left = state
+        more = solve(left)
+        s = s + systems.combine(more, basis)
+        return systems.add(a, more), s, missing(s)
+
+    missing = lambda s: systems.subtract(wanted, systems.moments(basis, w * s))
+    residual = lambda left: relative(jnp.stack(left) if isinstance(left, list) else left)
+    open_ = lambda state: jnp.max(residual(state[2])) > _SINGLE
+    once = lambda _, state: jax.lax.cond(open_(state), corrected, lambda state: state, state)
+    a, s, left = jax.lax.fori_loop(0, _ROUNDS, once, (a, s, missing(s)))
+    return a, s, residual(left)
 
 
 def _system(x, w, low, high):

@@ -62,6 +62,11 @@ def add(a, b):
     return [x + y for x, y in zip(a, b)] if isinstance(a, list) else a + b
 
 
+def subtract(a, b):
+    """Difference of two vectors over the basis."""
+    return [x - y for x, y in zip(a, b)] if isinstance(a, list) else a - b
+
+
 def stored(x, v, w):
     """The same array, which the compiler then stores, as it takes nothing out of a branch.
 

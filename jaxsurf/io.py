@@ -23,9 +23,9 @@ from jaxsurf.formats.through_meshio import meshio
 from jaxsurf.normals import estimate_normals
 from jaxsurf.series import Frame, frames_of
 from jaxsurf.shapes.cleaning import clean_mesh, merge_equal
-from jaxsurf.shapes.closest import fit_surface
 from jaxsurf.shapes.meshes import TriangleMesh
 from jaxsurf.shapes.resampling import sample_mesh
+from jaxsurf.shapes.smooth import fit_surface
 
 # What a cloud carries besides points and normals goes into files under these names.
 _OWN = ("boundary", "active", "spacing")

@@ -7,9 +7,10 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from jaxsurf.io import read
 from jaxsurf.shapes.cleaning import clean_mesh
-from jaxsurf.shapes.closest import ClosestPoint, fit_surface
+from jaxsurf.shapes.closest import ClosestPoint
 from jaxsurf.shapes.meshes import TriangleMesh
 from jaxsurf.shapes.resampling import sample_mesh
+from jaxsurf.shapes.smooth import fit_surface
 from jaxsurf.shapes.spacing import measure_quality
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
@@ -190,6 +191,38 @@ def test_nothing_is_lost_silently():
 
 
 # --- closest points and fits ---------------------------------------------------------------
+
+
+def wound(around: int, across: int) -> TriangleMesh:
+    """The torus of radii 1 and 0.4 by a grid in its two angles."""
+    u, v = (2 * np.pi * np.arange(k) / k for k in (around, across))
+    u, v = (a.ravel() for a in np.meshgrid(u, v, indexing="ij"))
+    rho = 1 + 0.4 * np.cos(v)
+    i, j = (a.ravel() for a in np.meshgrid(np.arange(around), np.arange(across), indexing="ij"))
+    at = lambda a, b: a % around * across + b % across
+    a, b, c, d = at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)
+    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return TriangleMesh(
+        np.stack([rho * np.cos(u), rho * np.sin(u), 0.4 * np.sin(v)], axis=1), triangles
+    )
+
+
+@pytest.mark.parametrize("grid", [(28, 28), (40, 40), (30, 60), (40, 20), (100, 20)])
+def test_fits_of_meshes_that_are_long_in_one_direction(grid):
+    """The nearest vertices lie on few columns there: normals were up to 34 degrees off."""
+    mesh = wound(*grid)
+    center = mesh.vertices * [1, 1, 0]
+    center /= np.linalg.norm(center, axis=1, keepdims=True)
+    angle = lambda n: np.arccos(np.clip(np.sum(n * (mesh.vertices - center) / 0.4, axis=1), -1, 1))
+    _, normals, used = fit_surface(mesh.vertices, mesh.vertex_normals, mesh, 4)
+    assert (used == 4).all()
+    assert angle(normals).max() < 1.3 * angle(mesh.vertex_normals).max()
+    off = lambda x: np.abs(np.hypot(np.hypot(x[:, 0], x[:, 1]) - 1, x[:, 2]) - 0.4)
+    middles, each = mesh.vertices[mesh.triangles].mean(axis=1), np.arange(len(mesh.triangles))
+    there = mesh.normals_at(each, np.full((len(each), 3), 1 / 3))
+    points, _, used = fit_surface(middles, there, mesh, 4)
+    assert (used == 4).all()
+    assert off(points).max() < 0.1 * off(middles).max()
 
 
 def test_closest_point_against_all_triangles():

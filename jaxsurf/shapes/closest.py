@@ -1,22 +1,11 @@
-"""Closest points of a triangle mesh, and of the smooth surface that its vertices lie on."""
+"""Closest points of a triangle mesh."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from scipy.spatial import cKDTree
-
-from jaxsurf.fits.monomials import polynomial_count
-from jaxsurf.fits.plane import TangentPlane, dot
-from jaxsurf.shapes.meshes import TriangleMesh
-
-# Cosine of the largest angle between a fitted normal and that of the mesh: 35 degrees.
-_MOST_TURN = 0.82
-# Of the normal equations of a fit: the vertices determine it where their condition is below.
-_WORST = 1e10
 
 
 class ClosestPoint:
@@ -116,58 +105,3 @@ def _closest_on_triangles(point, corners):
 
 def _dot(a, b):
     return np.einsum("...i,...i->...", a, b)
-
-
-def fit_surface(
-    points: Float[Array, "q 3"], normals: Float[Array, "q 3"], mesh: TriangleMesh, degree: int
-) -> tuple[Float[Array, "q 3"], Float[Array, "q 3"], Int[Array, " q"]]:
-    """Move points along their normals onto local polynomial fits of the vertices.
-
-    Around each point the nearest vertices on the same sheet (normals within 75 degrees) are
-    fitted by a height polynomial over the tangent plane, with weights that decay from the
-    point; its value at the point is the new position, its slope the new normal. Twice, the
-    second time over the improved plane. Where the vertices do not determine a polynomial of
-    this degree, or it turns the normal by more than 35 degrees, a lower degree is taken.
-
-    Args:
-        points: places near the surface, `(q, 3)`.
-        normals: unit normals there, `(q, 3)`.
-        mesh: its vertices are points of the surface.
-        degree: degree of the polynomials.
-
-    Returns:
-        New points, new normals, and the degree used at each point (0: left where it was).
-    """
-    points, normals = points.copy(), normals.copy()
-    tree = cKDTree(mesh.vertices)
-    used = np.zeros(len(points), np.int64)
-    for block in np.array_split(np.arange(len(points)), max(1, len(points) // 2048)):
-        todo, p = block, degree
-        while todo.size and p > 0:
-            x, m, good = points[todo], normals[todo], np.ones(len(todo), bool)
-            for _ in range(2):
-                x, m, solved = _fit_once(x, m, tree, mesh, p)
-                good &= solved
-            # Extrapolated over noisy borders, high degrees turn the normal at will; no mesh
-            # that resolves its surface has normals this far from those of its triangles.
-            good &= _dot(m, normals[todo]) > _MOST_TURN
-            points[todo[good]], normals[todo[good]], used[todo[good]] = x[good], m[good], p
-            todo, p = todo[~good], p - 1
-    return points, normals, used
-
-
-def _fit_once(points, normals, tree, mesh, degree):
-    size = polynomial_count(2, degree)
-    k = min(2 * size + 4, tree.n)
-    far, index = tree.query(points, k=range(1, k + 1))
-    slots, radius, normals = index.T, far[:, -1], normals.T
-    offsets = np.stack([v[slots] - x for v, x in zip(mesh.vertices.T, points.T)], axis=1)
-    same = sum(v[slots] * n for v, n in zip(mesh.vertex_normals.T, normals)) > 0.25
-    weights = np.where(same, np.exp(-5 * dot(offsets, offsets) / radius**2), 0)
-    plane = TangentPlane.at(normals, offsets, weights, radius, radius)
-    c, condition = plane.surface(0, degree)
-    # A fit that lifts a point by more than the distance between vertices is no fit.
-    enough = (same.sum(axis=0) >= size + 2) & (condition < _WORST)
-    enough &= np.abs(c[0]) < 1 / math.sqrt(k)
-    c = np.where(enough, c, 0)
-    return points + (c[0] * radius * normals).T, plane.tilted(normals, c[1:3]).T, enough

@@ -12,10 +12,11 @@ from numpy import ndarray as Array
 from jaxsurf.arguments import instance, real, whole
 from jaxsurf.cloud import PointCloud
 from jaxsurf.failures import warn
-from jaxsurf.shapes.closest import ClosestPoint, fit_surface
+from jaxsurf.shapes.closest import ClosestPoint
 from jaxsurf.shapes.meshes import TriangleMesh
 from jaxsurf.shapes.order import sort_cloud
 from jaxsurf.shapes.sampling import quasi_uniform
+from jaxsurf.shapes.smooth import fit_surface
 from jaxsurf.shapes.spacing import MOST, ideal_spacing, points_at
 
 

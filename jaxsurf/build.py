@@ -270,7 +270,7 @@ def _chosen(cloud, method, throw, needed, fewest):
     sizes, fewest = sizes_to_try(method, cloud.dim, k, available), k if fewest is None else fewest
     border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
     if not poor.size or not sizes:
-        _report(poor, share[poor], border, np.full(poor.size, k), method)
+        _report(cloud, neighbors, poor, share[poor], np.full(poor.size, k), method)
         return neighbors, found
 
     # Filled up with copies, so that few shapes are ever compiled.
@@ -292,7 +292,7 @@ def _chosen(cloud, method, throw, needed, fewest):
         chosen = np.where(better, size, chosen)
         news = some[0].T, some[1].T, *jax.tree.leaves(trial)
         kept = [np.where(better, new, old) for new, old in zip(news, kept)]
-    _report(poor, best[: poor.size], border, chosen, method)
+    _report(cloud, neighbors, poor, best[: poor.size], chosen, method)
 
     def put(old, new):
         full = np.array(old)
@@ -316,17 +316,35 @@ def _in_chunks(cloud, indices, mask, method, rows):
     return jax.tree.map(lambda *a: np.concatenate([np.asarray(b) for b in a], axis=-1), *parts)
 
 
-def _report(poor, best, border, chosen, method) -> None:
+def _report(cloud, neighbors, poor, best, chosen, method) -> None:
     """Warn of points inside the surface where no size serves."""
-    failed = (best < method.least_dominance) & ~border[poor]
+    failed = best < method.least_dominance
+    if cloud.boundary is not None:
+        failed &= ~np.asarray(cloud.boundary)[poor]
     if failed.any():
         worst = np.flatnonzero(failed)[np.argmin(best[failed])]
+        bare = _on_one_side(cloud, neighbors, poor[failed]) if cloud.boundary is None else 0
+        advice = "; if the surface has a border, mark it (boundary=js.detect_boundary(cloud))"
+        aside = f". {bare} of them have neighbours on one side only{advice}" if bare else ""
         warn(
             f"for {failed.sum()} points no size of neighbourhood serves {method}: the worst is "
             f"point {poor[worst]}, where the centre has a share of {best[worst]:.2g} of the "
             f"weights among the {chosen[worst]} nearest, {method.least_dominance} is needed; the "
-            "operator may have growing modes (js.spectral_estimate)"
+            f"operator may have growing modes (js.spectral_estimate){aside}"
         )
+
+
+# On half of a disk the mean of the points is 0.6 of their distances from its centre off it.
+_ASIDE = 0.45
+
+
+def _on_one_side(cloud, neighbors, rows) -> int:
+    """How many of these points look as if they were on a border."""
+    points, mask = np.asarray(cloud.points), np.asarray(neighbors.mask)[rows][:, :, None]
+    offsets = mask * (points[np.asarray(neighbors.indices)[rows]] - points[rows][:, None])
+    mean = np.linalg.norm(offsets.sum(axis=1), axis=1) / mask.sum(axis=(1, 2))
+    squared = np.sum(offsets**2, axis=(1, 2)) / mask.sum(axis=(1, 2))
+    return int(np.sum(mean > _ASIDE * np.sqrt(squared)))
 
 
 # --- checks --------------------------------------------------------------------------------

@@ -109,7 +109,7 @@ class Pieces:
 
     def __call__(self, blocks, *args):
         leaves = jax.tree.leaves((blocks, args))
-        if _takes_longer_to_compile(leaves):
+        if len(leaves[0]) and _takes_longer_to_compile(leaves):
             try:
                 return _by_pieces(self.programs.quick, jax.tree.map(np.asarray, blocks), args)
             except ValueError:  # within another program, if only with constants

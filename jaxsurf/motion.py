@@ -21,7 +21,7 @@ CODES = {
     2: "the normal of a neighbour next to it points to the other side: a fold, or another sheet",
     3: "its stencil is degenerate",
     4: "its list of neighbours no longer reaches",
-    5: "more neighbours than there is room for",
+    5: "more neighbours than there is room for, which `surface.search(margin=...)` makes",
 }
 # Points outside a list may come as near as this share of the way to the farthest one in it.
 _SKIN = 0.5

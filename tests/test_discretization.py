@@ -280,6 +280,7 @@ def test_interpolation():
     u = field(surface.cloud.points)[:, 0]
     jitted = jax.jit(lambda u, x: surface.interpolate(u, x))(u, wanted)
     np.testing.assert_allclose(jitted, surface.interpolate(u, wanted), atol=1e-12)
+    assert surface.interpolate(u, wanted[:0]).shape == (0,)
     with pytest.raises(ValueError, match=r"points: 1 is 3.* away from the nearest point"):
         surface.interpolate(u, np.array([[R + r, 0, 0], [0, 0, 3.5]]))
 

@@ -100,6 +100,13 @@ def test_derivatives_in_the_geometry():
     check_remainders(functionals, shape)
 
 
+def test_values_on_the_sphere():
+    """As accurate as the gradient: the modes of even degree, which are better, gain nothing."""
+    surface = js.discretize(js.sphere(2_000), method=js.GFDM(degree=4))
+    exact = np.repeat([0, 2, 6, 12], [1, 3, 5, 7])
+    np.testing.assert_allclose(js.eigenvalues(surface, 16), exact, atol=1e-3)
+
+
 def test_ritz_values_of_a_group_that_k_cuts_off():
     """The whole group counts, and so nothing depends on which of its functions come first."""
     surface = js.discretize(js.sphere(400), method=METHOD)

@@ -532,6 +532,16 @@ def test_where_no_neighbourhood_serves():
         js.choose_neighbors(cloud, method=_Flat())
 
 
+def test_a_border_that_is_not_marked_is_named():
+    """Of a bowl whose border nothing told of, the warning spoke of neighbourhoods only."""
+    bowl = js.surface_of_revolution(lambda s: (jnp.sin(s), -jnp.cos(s)), 400)
+    bare = js.PointCloud(bowl.points, bowl.normals)
+    rim = int(bowl.boundary.sum())
+    for method in (js.GFDM(degree=2), js.GFDM(degree=4)):
+        with pytest.warns(UserWarning, match=rf"{rim} of them have .* one side only.*boundary="):
+            js.choose_neighbors(bare, method=method)
+
+
 class _Flat(NearestPair):
     """Its centre has no weight whatever the neighbours."""
 

@@ -85,9 +85,9 @@ def eigenmodes(
         Values, functions, and how good they are.
 
     Accuracy: that of the operator: with n = 10,000 and order 4 the first 24 non-zero values
-    within 1e-5 on the unit sphere (`tests/test_eigen.py`); those of `js.eigenvalues` are more
-    accurate from degree 3 on. In float32 values are within 1e-3 on 500
-    points (`tests/test_eigen.py`), their gradients in the points within 1 %
+    within 1e-5 on the unit sphere (`tests/test_eigen.py`); those of `js.eigenvalues` are mostly
+    more accurate from degree 3 on (not on a sphere, see there). In float32 values are within 1e-3
+    on 500 points (`tests/test_eigen.py`), their gradients in the points within 1 %
     (`tests/test_forms.py`).
     Differentiable: once, forward and reverse, in the weights of the operator (so in points and
     normals) and of the conditions. Values: exactly, unless two of a group coincide to

@@ -13,7 +13,8 @@ from jaxtyping import Array, ArrayLike, Float
 from ..arguments import as_float, finite, flag, instance, switched_off
 from ..arguments import traced_call as user
 from ..boundary import Closure
-from ..failures import is_concrete
+from ..compiling import at_once
+from ..failures import is_concrete, raise_at
 from ..operators import divergence_of
 from ..stencils.algebra import AbstractOperator
 from ..stencils.gathers import take
@@ -58,7 +59,8 @@ class AdvectionDiffusionReaction(AbstractEvolution):
             `(n, 1)`, `(n, c)` in space, or a function of time that returns one of these. In
             space it stands inside the divergence.
         gradient: the surface gradient, needed with a velocity.
-        velocity: tangential, `(n, d)`, or a function of time that returns one.
+        velocity: tangential (in the conservative form that is checked), `(n, d)`, or a function of
+            time that returns one.
         reaction: `(t, u, args) -> f`, of the shape of u; None for none.
         conservative: the form above; if False $v\cdot\nabla u$ in place of $\nabla\cdot(v\,u)$.
         stabilization: an operator added to the right-hand side, that damps what advection
@@ -72,8 +74,9 @@ class AdvectionDiffusionReaction(AbstractEvolution):
     (`tests/test_time_pde.py`).
     Differentiable: in every array, forward and reverse.
     Raises:
-        ValueError: a velocity without a gradient, neither laplacian nor velocity, a diffusivity
-            whose shape fits neither points nor species, `mass` with boundary conditions.
+        ValueError: a velocity without a gradient, or with a normal part; neither laplacian nor
+            velocity; a diffusivity whose shape fits neither points nor species, `mass` with
+            boundary conditions. From `integrate`: minus a Laplacian.
 
     Example:
         >>> cloud = js.sphere(500)
@@ -128,6 +131,8 @@ class AdvectionDiffusionReaction(AbstractEvolution):
             self.gradient, self.velocity = gradient, velocity
             if not callable(velocity):  # one stencil of scalars does the work of d
                 self.velocity = _checked_velocity(velocity, gradient)
+                if conservative:
+                    _check_tangential(self.velocity, gradient)
                 self.advection = _along(gradient, self.velocity, conservative)
 
     @property
@@ -161,7 +166,17 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         return _UNDAMPED if undamped else None
 
     def check(self, t):
-        if not callable(self.diffusivity) or self.laplacian is None:
+        if self.laplacian is None:
+            return
+        if isinstance(self.laplacian, Stencil) and is_concrete(self.laplacian.weights):
+            with at_once():  # also within something that is traced
+                mean = float(jnp.mean(self.laplacian.diagonal))
+            if mean > 0:
+                raise ValueError(
+                    f"the diagonal of `laplacian` has the mean {mean:.3g}, expected one below 0: "
+                    "this is minus a Laplacian, and diffusion by it has no solution"
+                )
+        if not callable(self.diffusivity):
             return
         values = user(self.diffusivity, "diffusivity", t)
         if is_concrete(values) and not (np.asarray(values) >= 0).all():
@@ -249,6 +264,28 @@ def _advected(gradient: Stencil, velocity, u: Field, conservative: bool) -> Fiel
     if conservative:
         return divergence_of(gradient)(u[..., None] * v)
     return jnp.sum(gradient(u) * v, axis=-1)
+
+
+# The sine of the angle that velocities may be off the tangent plane: 3 degrees at the fastest.
+_OFF = 0.05
+
+
+def _check_tangential(velocity, gradient: Stencil) -> None:
+    """A divergence sees what is normal in a velocity, which is none of a surface at rest."""
+    if not is_concrete(velocity, gradient.weights):
+        return
+    weights, velocity = np.asarray(gradient.weights), np.asarray(velocity)
+    # Rows of a gradient are tangential, those of DC-PSE nearly; in a plane nothing is normal.
+    sizes, axes = np.linalg.eigh(np.einsum("kin,kjn->nij", weights, weights))
+    normal = np.abs(np.einsum("ni,ni->n", velocity, axes[:, :, 0]))
+    most = _OFF * np.linalg.norm(velocity, axis=1).max()
+    raise_at(
+        (normal > most) & (sizes[:, 0] < 0.2 * sizes[:, 1]),
+        f"the velocity at point {{i}} has the normal part {{v:.3g}}, expected at most {most:.3g}: "
+        "that of a surface at rest is tangential. Take the normal part away, or take "
+        "conservative=False, which does not see it",
+        normal,
+    )
 
 
 def _checked_velocity(velocity, gradient: Stencil) -> Array:

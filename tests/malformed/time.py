@@ -36,7 +36,9 @@ def heat(**settings):
 
 
 def moved(**settings):
-    settings = dict(gradient=gradient(), velocity=jnp.ones((N, 2))) | settings
+    normals = js.circle(N).normals
+    along = jnp.stack([-normals[:, 1], normals[:, 0]], axis=1)
+    settings = dict(gradient=gradient(), velocity=along) | settings
     return js.AdvectionDiffusionReaction(**settings)
 
 
@@ -205,11 +207,15 @@ SPECIAL = [
         ("diffusivity text", lambda: heat(diffusivity="1"), ("diffusivity", "'1'")),
         ("diffusivity complex", lambda: heat(diffusivity=1j * U), ("diffusivity", "complex")),
         ("diffusivity None", lambda: heat(diffusivity=None), ("diffusivity", "None")),
+        ("minus a laplacian", lambda: integrate(js.AdvectionDiffusionReaction(-laplacian())),
+         ("laplacian", "diagonal", "below 0")),
         ("reaction no function", lambda: heat(reaction=U), ("reaction", "function")),
         ("velocity without gradient", lambda: moved(gradient=None), ("velocity", "gradient")),
         ("velocity scalar", lambda: moved(velocity=1.0), ("velocity", "()", "(12, 2)")),
         ("velocity in space", lambda: moved(velocity=np.ones((N, 3))), ("(12, 3)", "(12, 2)")),
         ("velocity NaN", lambda: moved(velocity=np.full((N, 2), nan)), ("velocity", "point 0")),
+        ("velocity along normals", lambda: moved(velocity=js.circle(N).normals),
+         ("velocity", "point 0", "normal part 1", "0.05")),
         ("velocity complex", lambda: moved(velocity=1j * np.ones((N, 2))), ("velocity", "complex")),
         ("gradient an array", lambda: moved(gradient=np.ones((N, 2))), ("gradient", "(12, 2)")),
         ("gradient of other points", lambda: heat(gradient=ring(20)[2]), ("gradient", "20", "12")),

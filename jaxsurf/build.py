@@ -324,6 +324,7 @@ def _report(cloud, neighbors, poor, best, chosen, method) -> None:
     if failed.any():
         worst = np.flatnonzero(failed)[np.argmin(best[failed])]
         bare = _on_one_side(cloud, neighbors, poor[failed]) if cloud.boundary is None else 0
+        bare = bare if bare > _RIM * cloud.n ** (1 - 1 / (cloud.dim - 1)) else 0
         advice = "; if the surface has a border, mark it (boundary=js.detect_boundary(cloud))"
         aside = f". {bare} of them have neighbours on one side only{advice}" if bare else ""
         warn(
@@ -334,8 +335,9 @@ def _report(cloud, neighbors, poor, best, chosen, method) -> None:
         )
 
 
-# On half of a disk the mean of the points is 0.6 of their distances from its centre off it.
-_ASIDE = 0.45
+# On half of a disk the mean of the points is 0.6 of their distances from its centre off it. Fewer
+# such points than this, in units of those across a surface, are folds.
+_ASIDE, _RIM = 0.45, 0.5
 
 
 def _on_one_side(cloud, neighbors, rows) -> int:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..arguments import as_float, differentiable, finite, instance, pair, switched_off
+from ..cloud import PointCloud
 from ..compiling import sized_jit
 from ..discretization import Discretization
 from ..failures import check, marking, not_positive, raise_at
@@ -143,7 +144,7 @@ class MappedShape(AbstractShape):
             surface = self.base(own)
         else:
             surface = self.base
-        points, normals = surface.cloud.seen.points, surface.cloud.seen.normals
+        points, normals = starts(surface.cloud)
         images, normals, area = _mapped(self._program(theta, points), points, normals)
         text = "f flattens the surface at point {i}: it stretches areas there by {v}"
         on = surface.cloud.active
@@ -345,6 +346,19 @@ def _followed(shape: AbstractShape, change: Callable) -> AbstractShape:
 
 def geometry(surface: Discretization) -> tuple[Array, Array]:
     return surface.cloud.points, surface.cloud.normals
+
+
+def starts(cloud: PointCloud) -> tuple[Array, Array]:
+    """Points and normals that a family moves: switched-off rows go where one that is on goes.
+
+    Anywhere else a function of the user's may have no derivative, and 0 times that is NaN.
+    """
+    on = cloud.active
+    if on is None:
+        return cloud.points, cloud.normals
+    first = jnp.argmax(on)
+    along = lambda x: switched_off(on, x, x[first])
+    return along(cloud.points), along(cloud.normals)
 
 
 def spread_evenly(surface: Discretization, onto: Callable) -> tuple[Array, Array]:

@@ -348,6 +348,8 @@ def test_level_sets_are_spread_evenly_again():
     after = shape.renewed(axes, before.search())(axes)
     assert closest(after).min() > 1.1 * closest(before).min()
     assert float(jnp.abs(jnp.sum((after.cloud.points / axes) ** 2, axis=1) - 1).max()) < 1e-12
+    twice = js.MappedShape(scaled, shape).renewed((axes, 2.0), before.search())
+    np.testing.assert_allclose(twice((axes, 2.0)).cloud.points, 2 * after.cloud.points, rtol=1e-12)
 
 
 def test_stars_and_maps_are_spread_evenly_again():
@@ -377,6 +379,14 @@ def test_stars_and_maps_are_spread_evenly_again():
         np.testing.assert_allclose(after.areas.sum(), before.areas.sum(), rtol=2e-3)
         np.testing.assert_allclose(radius(after.cloud.normals, axis=1), 1, rtol=1e-12)
         assert not after.code.any()
+
+
+def test_lists_of_images_need_not_reach_where_they_are_mapped_from():
+    shape = js.MappedShape(scaled, js.star_shape(ball(), 3))
+    still, long = ((BALL, jnp.array([length, 1.0, 1.0])) for length in (1.0, 3.0))
+    surface = shape.renewed(long, shape(still).search(margin=2))(long)
+    assert not surface.code.any()
+    np.testing.assert_allclose(js.volume(surface), 4 * np.pi, rtol=1e-2)
 
 
 @pytest.mark.parametrize(

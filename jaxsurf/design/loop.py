@@ -16,7 +16,6 @@ import optax
 from jaxtyping import PyTree
 
 from ..discretization import Discretization
-from ..renew import NeighborSearch
 from ..time.checkpoint import Checkpoint, digest, read_back, written
 from .asked import FAR, ILL, refuse_start
 from .lagrangian import (
@@ -31,7 +30,7 @@ from .lagrangian import (
     started,
 )
 from .outcome import COLUMNS, ShapeOptimization
-from .shape import AbstractShape, unchecked_surface, with_wear
+from .shape import AbstractShape, renewed_with_room, unchecked_surface, with_wear
 
 # A step that fails is halved so often.
 _HALVINGS = 12
@@ -303,7 +302,7 @@ def _covered(problem, shape, theta, values, multipliers, search):
 def _with_new_lists(problem, shape, theta, multipliers, search) -> tuple[AbstractShape, str]:
     """The shape with neighbours found anew at theta, and what is wrong with it."""
     try:
-        anew = _renewed(shape, theta, search)
+        anew = _quietly(renewed_with_room, shape, theta, search)
     except ValueError as error:
         return shape, f"neighbours could not be found anew: {error}"
     code = int(evaluated(problem.at(anew), theta, multipliers)[1].code)
@@ -325,14 +324,6 @@ def _is_only_far(surface: Discretization) -> bool:
         return set(np.asarray(surface.code).tolist()) <= {0, FAR}
     except ValueError:  # it has no operators
         return False
-
-
-def _renewed(shape: AbstractShape, theta, search: NeighborSearch) -> AbstractShape:
-    try:
-        return _quietly(shape.renewed, theta, search)
-    except ValueError:  # there may be no room
-        room = unchecked_surface(shape, theta).search(margin=2.0)
-        return _quietly(shape.renewed, theta, room)
 
 
 def _quietly(change: Callable, *args) -> AbstractShape:

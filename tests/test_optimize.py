@@ -478,6 +478,25 @@ def test_features_are_no_thinner_than_asked():
     np.testing.assert_allclose(found.theta, np.sqrt(0.4), rtol=3e-2)
 
 
+def test_features_of_a_surface_with_a_mask_are_no_thinner_than_asked():
+    """Radii of switched-off points are infinite: there the constraint is met, whatever comes."""
+    cloud, n, off = ball().cloud, 200, jnp.full((20, 3), jnp.nan)
+    on = jnp.arange(n + 20) < n
+    rows = [jnp.concatenate([a, off]) for a in (cloud.points, cloud.normals)]
+    part = js.PointCloud(*rows, active=on)
+    thick = {"thick": lambda s: 1 - js.medial_radius(s) / 0.8}
+    radius = lambda s: jnp.sum(jnp.where(on[:, None], s.cloud.points, 0) ** 2) / n
+    found = js.optimize_shape(
+        radius, js.MappedShape(scaled, js.discretize(part, method=METHOD)), jnp.array(1.2),
+        optimizer=LBFGS, inequalities=thick, ctol=1e-3, rtol=1e-3,
+    )  # fmt: skip
+    assert found.converged
+    np.testing.assert_allclose(found.theta, 0.8, rtol=2e-3)
+    assert np.isneginf(found.inequalities["thick"][n:]).all()
+    assert not found.multipliers["thick"][n:].any()
+    assert np.isfinite(found.history["gradient"]).all()
+
+
 @pytest.mark.parametrize("renew", [False, True])
 def test_the_same_code_with_other_numbers_compiles_nothing(renew):
     """Written anew, as where a cell of a notebook is run again: least w a² + 1 / a²."""

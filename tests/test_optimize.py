@@ -204,8 +204,30 @@ def test_a_run_that_goes_on_from_its_file_ends_in_the_same_bits(tmp_path):
     assert np.array_equal(again.theta, whole.theta)
     for name in set(whole.history) - {"seconds"}:
         np.testing.assert_array_equal(again.history[name], whole.history[name])
-    with pytest.raises(ValueError, match="another run"):
-        axes_found(ADAM, steps=13, checkpoint=parts)
+    with pytest.raises(ValueError, match="another run: shape, start, functions, optimiser or"):
+        axes_found(ADAM, steps=12, rtol=1e-3, checkpoint=parts)
+
+
+@pytest.mark.parametrize("optimizer", [LBFGS, ADAM])
+def test_steps_that_are_used_up_go_on_where_more_are_given(optimizer, tmp_path):
+    """As if they had been given at first; where fewer are, it is what there is."""
+    parts = js.Checkpoint(tmp_path / "run.npz", every=2)
+    few = axes_found(optimizer, steps=3, rtol=0, checkpoint=parts)
+    assert "all 3 steps used" in few.stopped
+    lengths = []
+    longer = axes_found(
+        optimizer, steps=7, rtol=0, checkpoint=parts,
+        callback=lambda now: lengths.append(len(now.history["seconds"])),
+    )  # fmt: skip
+    assert lengths == [5, 6, 7, 8] and "all 7 steps used" in longer.stopped
+    whole = axes_found(optimizer, steps=7, rtol=0)
+    again = axes_found(optimizer, steps=5, rtol=0, checkpoint=parts)
+    assert "all 7 steps used" in again.stopped
+    for found in (longer, again):
+        assert np.array_equal(found.theta, whole.theta)
+        for name in set(whole.history) - {"seconds"}:
+            np.testing.assert_array_equal(found.history[name], whole.history[name])
+        assert (np.diff(found.history["seconds"]) > 0).all()
 
 
 FACTOR = 1.0

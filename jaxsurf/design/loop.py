@@ -86,9 +86,13 @@ class _File(NamedTuple):
         """As far as it has come, if it is there."""
         if not self.path.exists():
             return run
-        found = read_back(self.path, self.told, run)
+        differ = "shape, start, functions, optimiser or settings"
+        found = read_back(self.path, self.told, run, same_sizes=False, run=differ)
+        # More steps may be asked for now.
+        longer = lambda rows, room: np.concatenate([rows, room[len(rows) :]])
+        history = {name: longer(rows, run.history[name]) for name, rows in found.history.items()}
         place = lambda new, old: jnp.asarray(new) if isinstance(old, jax.Array) else new
-        return jax.tree.map(place, found, run)
+        return jax.tree.map(place, found._replace(history=history), run)
 
 
 class Loop(NamedTuple):
@@ -118,8 +122,9 @@ class Loop(NamedTuple):
         run = self.first(problem, shape, theta)
         file = None
         if self.checkpoint is not None:
-            known = (self._replace(callback=None, checkpoint=None), shape, theta)
-            told = digest((known, problem))
+            numbers = self.numbers | dict(steps=None)
+            known = self._replace(callback=None, checkpoint=None, numbers=numbers)
+            told = digest(((known, shape, theta), problem))
             file = _File(Path(self.checkpoint.path), max(1, round(self.checkpoint.every)), told)
             run = file.read(run)
             shape = eqx.combine(run.lists, shape)
@@ -272,8 +277,8 @@ class Loop(NamedTuple):
         small = float(run.values.size) <= self.numbers["rtol"] * float(run.first)
         if small and float(run.values.violation) <= self.numbers["ctol"]:
             return "converged"
-        steps, off = self.numbers["steps"], float(run.values.violation)
-        if int(run.step) < steps:
+        steps, off = int(run.step), float(run.values.violation)
+        if steps < self.numbers["steps"]:
             return ""
         unmet = f", and constraints are off by {off:.2g}" if off > self.numbers["ctol"] else ""
         return f"all {steps} steps used{unmet}"

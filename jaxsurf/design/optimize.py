@@ -74,7 +74,7 @@ def optimize_shape(
             preconditioner.
         callback: called with the `ShapeOptimization` so far after each step; True ends it.
         checkpoint: where all is written after every so many steps; if the file is there, the same
-            run goes on from it and ends in the same bits.
+            run, of more `steps` too, goes on from it and ends in the same bits.
         throw: raise where it cannot go on; if False, see `stopped`.
 
     Returns:

@@ -34,15 +34,15 @@ from .design.functionals import willmore_energy as willmore_energy
 from .design.harmonics import spherical_harmonics as spherical_harmonics
 from .design.harmonics import star_shape as star_shape
 from .design.level_sets import LevelSetShape as LevelSetShape
+from .design.mapped import MappedShape as MappedShape
+from .design.mapped import rigid_motion as rigid_motion
 from .design.optimize import optimize_shape as optimize_shape
 from .design.outcome import OptimizationError as OptimizationError
 from .design.outcome import ShapeOptimization as ShapeOptimization
 from .design.repulsion import medial_radius as medial_radius
 from .design.repulsion import tangent_point_energy as tangent_point_energy
 from .design.shape import AbstractShape as AbstractShape
-from .design.shape import MappedShape as MappedShape
 from .design.shape import NormalShape as NormalShape
-from .design.shape import rigid_motion as rigid_motion
 from .design.sobolev import sobolev_gradient as sobolev_gradient
 from .design.taylor import TaylorRemainders as TaylorRemainders
 from .design.taylor import taylor_remainders as taylor_remainders

@@ -17,7 +17,7 @@ from .cloud import PointCloud
 from .failures import is_concrete, needs_values, without_derivatives
 from .interpolation import interpolated
 from .kept import Kept
-from .motion import code_of, folded, moved_cloud, raise_for
+from .motion import code_of, folded, is_judged, moved_cloud, raise_for
 from .neighbors import Neighbors, switched_on
 from .renew import NeighborSearch, renewed
 from .stencils.algebra import Composition
@@ -323,7 +323,7 @@ class Discretization(eqx.Module):
             surface = Discretization(cloud, *lists, self.found)
         else:
             surface = self._renewed(cloud, search)
-        if is_concrete(surface):
+        if is_judged() and is_concrete(surface):
             surface.check()
         return surface
 

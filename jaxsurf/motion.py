@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import contextvars
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +28,27 @@ CODES = {
 # Points outside a list may come as near as this share of the way to the farthest one in it.
 _SKIN = 0.5
 
+_judging = contextvars.ContextVar("judging", default=True)
+
 # Each brings normals closer to where a rigid motion takes them, by the error of the gradient.
 _TURNS = 5
+
+
+@contextlib.contextmanager
+def unjudged() -> Iterator[None]:
+    """Surfaces that are moved within it raise no error for their code: they are moved on.
+
+    Their lists may be those of where they are moved to, and not reach before.
+    """
+    token = _judging.set(False)
+    try:
+        yield
+    finally:
+        _judging.reset(token)
+
+
+def is_judged() -> bool:
+    return _judging.get()
 
 
 def moved_cloud(cloud: PointCloud, points, normals, gradient: Callable[[], Callable]) -> PointCloud:

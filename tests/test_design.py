@@ -189,6 +189,24 @@ def test_harmonics_are_orthonormal_and_harmonic():
         assert float(jnp.abs(jnp.trace(hessian, axis1=1, axis2=2)).max()) < 1e-10
 
 
+@pytest.mark.parametrize("name", ["star", "map", "level set"])
+def test_switched_off_points_have_no_part_in_derivatives(name):
+    """Whatever stands there, and where the map has none at the origin: those of the others."""
+    cloud, off = ball().cloud, jnp.zeros((20, 3))
+    rows = [jnp.concatenate([a, off * jnp.nan]) for a in (cloud.points, cloud.normals)]
+    part = js.PointCloud(*rows, active=jnp.arange(N + 20) < N)
+    unit = lambda x, a: a[0] * x / jnp.linalg.norm(x)
+    make, theta = {
+        "star": (lambda surface: js.star_shape(surface, 4), BALL.at[7].set(0.2)),
+        "map": (lambda surface: js.MappedShape(unit, surface), jnp.array([1.5])),
+        "level set": (lambda surface: js.LevelSetShape(egg, surface), jnp.array([1.0, 0.95, 0.9])),
+    }[name]
+    shape = lambda cloud: make(js.discretize(cloud, method=js.GFDM(degree=2)))
+    slopes = lambda shape: jax.grad(lambda t: js.volume(shape(t)))(theta)
+    found, wanted = slopes(shape(part)), slopes(shape(cloud))
+    np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
+
+
 def test_rotations_are_smooth_at_none():
     turn = lambda a: js.rigid_motion(jnp.array([1.0, 2.0, 3.0]), (a, jnp.zeros(3)))
     slope = jax.jacfwd(turn)(jnp.zeros(3))

@@ -204,8 +204,30 @@ def test_a_run_that_goes_on_from_its_file_ends_in_the_same_bits(tmp_path):
     assert np.array_equal(again.theta, whole.theta)
     for name in set(whole.history) - {"seconds"}:
         np.testing.assert_array_equal(again.history[name], whole.history[name])
-    with pytest.raises(ValueError, match="another run"):
-        axes_found(ADAM, steps=13, checkpoint=parts)
+    with pytest.raises(ValueError, match="another run: shape, start, functions, optimiser or"):
+        axes_found(ADAM, steps=12, rtol=1e-3, checkpoint=parts)
+
+
+@pytest.mark.parametrize("optimizer", [LBFGS, ADAM])
+def test_steps_that_are_used_up_go_on_where_more_are_given(optimizer, tmp_path):
+    """As if they had been given at first; where fewer are, it is what there is."""
+    parts = js.Checkpoint(tmp_path / "run.npz", every=2)
+    few = axes_found(optimizer, steps=3, rtol=0, checkpoint=parts)
+    assert "all 3 steps used" in few.stopped
+    lengths = []
+    longer = axes_found(
+        optimizer, steps=7, rtol=0, checkpoint=parts,
+        callback=lambda now: lengths.append(len(now.history["seconds"])),
+    )  # fmt: skip
+    assert lengths == [5, 6, 7, 8] and "all 7 steps used" in longer.stopped
+    whole = axes_found(optimizer, steps=7, rtol=0)
+    again = axes_found(optimizer, steps=5, rtol=0, checkpoint=parts)
+    assert "all 7 steps used" in again.stopped
+    for found in (longer, again):
+        assert np.array_equal(found.theta, whole.theta)
+        for name in set(whole.history) - {"seconds"}:
+            np.testing.assert_array_equal(found.history[name], whole.history[name])
+        assert (np.diff(found.history["seconds"]) > 0).all()
 
 
 FACTOR = 1.0
@@ -348,6 +370,8 @@ def test_level_sets_are_spread_evenly_again():
     after = shape.renewed(axes, before.search())(axes)
     assert closest(after).min() > 1.1 * closest(before).min()
     assert float(jnp.abs(jnp.sum((after.cloud.points / axes) ** 2, axis=1) - 1).max()) < 1e-12
+    twice = js.MappedShape(scaled, shape).renewed((axes, 2.0), before.search())
+    np.testing.assert_allclose(twice((axes, 2.0)).cloud.points, 2 * after.cloud.points, rtol=1e-12)
 
 
 def test_stars_and_maps_are_spread_evenly_again():
@@ -377,6 +401,14 @@ def test_stars_and_maps_are_spread_evenly_again():
         np.testing.assert_allclose(after.areas.sum(), before.areas.sum(), rtol=2e-3)
         np.testing.assert_allclose(radius(after.cloud.normals, axis=1), 1, rtol=1e-12)
         assert not after.code.any()
+
+
+def test_lists_of_images_need_not_reach_where_they_are_mapped_from():
+    shape = js.MappedShape(scaled, js.star_shape(ball(), 3))
+    still, long = ((BALL, jnp.array([length, 1.0, 1.0])) for length in (1.0, 3.0))
+    surface = shape.renewed(long, shape(still).search(margin=2))(long)
+    assert not surface.code.any()
+    np.testing.assert_allclose(js.volume(surface), 4 * np.pi, rtol=1e-2)
 
 
 @pytest.mark.parametrize(
@@ -466,6 +498,25 @@ def test_features_are_no_thinner_than_asked():
     )  # fmt: skip
     assert found.converged
     np.testing.assert_allclose(found.theta, np.sqrt(0.4), rtol=3e-2)
+
+
+def test_features_of_a_surface_with_a_mask_are_no_thinner_than_asked():
+    """Radii of switched-off points are infinite: there the constraint is met, whatever comes."""
+    cloud, n, off = ball().cloud, 200, jnp.full((20, 3), jnp.nan)
+    on = jnp.arange(n + 20) < n
+    rows = [jnp.concatenate([a, off]) for a in (cloud.points, cloud.normals)]
+    part = js.PointCloud(*rows, active=on)
+    thick = {"thick": lambda s: 1 - js.medial_radius(s) / 0.8}
+    radius = lambda s: jnp.sum(jnp.where(on[:, None], s.cloud.points, 0) ** 2) / n
+    found = js.optimize_shape(
+        radius, js.MappedShape(scaled, js.discretize(part, method=METHOD)), jnp.array(1.2),
+        optimizer=LBFGS, inequalities=thick, ctol=1e-3, rtol=1e-3,
+    )  # fmt: skip
+    assert found.converged
+    np.testing.assert_allclose(found.theta, 0.8, rtol=2e-3)
+    assert np.isneginf(found.inequalities["thick"][n:]).all()
+    assert not found.multipliers["thick"][n:].any()
+    assert np.isfinite(found.history["gradient"]).all()
 
 
 @pytest.mark.parametrize("renew", [False, True])

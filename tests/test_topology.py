@@ -69,6 +69,36 @@ def test_two_that_meet_become_one(optimizer):
     np.testing.assert_allclose(width(fine), 0.9, rtol=5e-3)
 
 
+def turned(x, size):
+    return size * x[jnp.array([2, 0, 1])]
+
+
+def test_two_that_meet_become_one_under_a_map_as_well():
+    """In three times the size, turned: points, and neighbours, are those of the level set."""
+    shape = js.LevelSetShape(metaballs, sampled(metaballs, 1.6), BOX)
+    width = lambda surface: surface.mean(surface.cloud.points[:, 1] ** 2) / 9
+    found = js.optimize_shape(
+        lambda surface: (width(surface) - 0.9) ** 2,
+        js.MappedShape(lambda x, nothing: turned(x, 3.0), shape), (1.6, 0.0),
+        optimizer=optax.sgd(0.1),
+    )  # fmt: skip
+    assert found.converged and found.history["rebuilt"].sum() == 1
+    theta, fine = found.theta[0], sampled(metaballs, float(found.theta[0]), 2_000)
+    np.testing.assert_allclose(area(found.surface), 9 * area(fine), rtol=2e-3)
+    assert found.shape.base.topology.tolist() == [1, 0]
+    before = js.MappedShape(turned, shape)
+    apart = (1.6, jnp.array([3.0, 0.5, 1.0]))
+    known = before.rebuilt(apart)
+    assert known.rebuilt(apart) is known and known.base.topology.tolist() == [2, 0]
+    lists = lambda shape: shape.base.surface.neighbors.indices
+    assert np.array_equal(lists(known), lists(before)), "only topology was to be noted"
+    there = theta, apart[1]
+    one = known.rebuilt(there)
+    wanted = js.choose_neighbors(one(there).cloud, method=METHOD)
+    rows = [map(set, indices.tolist()) for indices in (lists(one), wanted.indices)]
+    assert np.mean([len(a & b) / len(b) for a, b in zip(*rows)]) > 0.99
+
+
 def test_one_that_is_born_counts():
     """The area that is reached is that of both; without bounds only the first would be seen."""
     wanted = 4 * np.pi * (1.2**2 + 0.8**2)

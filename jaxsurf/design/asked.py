@@ -79,12 +79,24 @@ def refuse_start(theta, values: Values) -> None:
     code = int(values.code)
     if not all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(theta)):
         raise ValueError(f"project makes {theta} of the first theta, expected finite numbers")
-    named = {"objective": values.objective} | values.equalities | values.inequalities
-    for name, x in named.items():
-        if not np.isfinite(np.asarray(x)).all():
-            kind = "objective" if name == "objective" else f"constraint {name!r}"
-            raise ValueError(f"{kind} is {np.asarray(x)} at the first theta, expected a number")
+    _refuse_numbers("objective", values.objective)
+    for name, x in values.equalities.items():
+        _refuse_numbers(f"constraint {name!r}", x)
+    for name, x in values.inequalities.items():
+        # One that is -inf is met, whatever comes: that of a switched-off point, say.
+        _refuse_numbers(f"constraint {name!r}", np.where(np.isneginf(x), 0, x))
     if code == 3:
         raise ValueError("the gradient at the first theta is not finite, where the objective is")
     if code:
         raise ValueError(f"at the first theta {ILL[code]}")
+
+
+def _refuse_numbers(what: str, given: Any) -> None:
+    """Name the first that is not finite, and tell how many there are."""
+    x = np.asarray(given)
+    where = np.argwhere(~np.isfinite(x)).tolist()
+    if where:
+        entry = f" in entry {', '.join(map(str, where[0]))}" if x.ndim else ""
+        more = f" (and {len(where) - 1} more)" if len(where) > 1 else ""
+        value = x[tuple(where[0])]
+        raise ValueError(f"{what} is {value} at the first theta{entry}{more}, expected a number")

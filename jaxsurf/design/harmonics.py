@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..arguments import as_float, flag, instance, shaped, whole
 from ..discretization import Discretization
 from ..failures import check
-from .shape import MappedShape
+from .mapped import MappedShape
 
 # How far the length of a direction may be from one.
 _UNIT = 1e-5

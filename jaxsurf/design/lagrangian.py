@@ -84,9 +84,16 @@ class Asked(NamedTuple):
 
     def measured(self, surface: Discretization, args: tuple) -> tuple[Array, dict, dict]:
         """Objective, equalities and inequalities."""
-        value = lambda f, name: as_float(traced_call(f, name, surface, *args), name)
+        value = lambda f, name: _number(traced_call(f, name, surface, *args), name)
         each = lambda some: {name: value(f, f"constraint {name!r}") for name, f in some.items()}
         return value(self.objective, "objective"), each(self.equalities), each(self.inequalities)
+
+
+def _number(found: Any, name: str) -> Array:
+    """What a function of the user's returns, which has to have a slope."""
+    if bool in [getattr(x, "dtype", type(x)) for x in jax.tree.leaves(found)]:
+        raise TypeError(f"{name} is true or false, expected a number: a - b in place of a > b, say")
+    return as_float(found, name)
 
 
 class _Aside:

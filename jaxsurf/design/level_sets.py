@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from ..arguments import switched_off
 from ..cloud import PointCloud
 from ..discretization import Discretization
 from ..failures import unchecked
@@ -24,6 +23,7 @@ from .shape import (
     check_surface,
     geometry,
     spread_evenly,
+    starts,
     unchecked_surface,
     with_lists,
 )
@@ -100,12 +100,7 @@ class LevelSetShape(AbstractShape):
 
     def __call__(self, theta: PyTree) -> Discretization:
         phi = lambda x: self.phi(x, theta)
-        cloud = self.surface.cloud
-        # A switched-off point goes where another goes, and stays where it is.
-        start = cloud.points
-        if cloud.active is not None:
-            start = switched_off(cloud.active, start, start[jnp.argmax(cloud.active)])
-        points = project_to_level_set(phi, start)
+        points = project_to_level_set(phi, starts(self.surface.cloud)[0])
         return self.surface.moved(points, level_set_normals(phi, points))
 
     def renewed(self, theta: PyTree, search: NeighborSearch) -> LevelSetShape:

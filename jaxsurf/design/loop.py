@@ -16,7 +16,6 @@ import optax
 from jaxtyping import PyTree
 
 from ..discretization import Discretization
-from ..renew import NeighborSearch
 from ..time.checkpoint import Checkpoint, digest, read_back, written
 from .asked import FAR, ILL, refuse_start
 from .lagrangian import (
@@ -31,7 +30,7 @@ from .lagrangian import (
     started,
 )
 from .outcome import COLUMNS, ShapeOptimization
-from .shape import AbstractShape, unchecked_surface, with_wear
+from .shape import AbstractShape, renewed_with_room, unchecked_surface, with_wear
 
 # A step that fails is halved so often.
 _HALVINGS = 12
@@ -87,9 +86,13 @@ class _File(NamedTuple):
         """As far as it has come, if it is there."""
         if not self.path.exists():
             return run
-        found = read_back(self.path, self.told, run)
+        differ = "shape, start, functions, optimiser or settings"
+        found = read_back(self.path, self.told, run, same_sizes=False, run=differ)
+        # More steps may be asked for now.
+        longer = lambda rows, room: np.concatenate([rows, room[len(rows) :]])
+        history = {name: longer(rows, run.history[name]) for name, rows in found.history.items()}
         place = lambda new, old: jnp.asarray(new) if isinstance(old, jax.Array) else new
-        return jax.tree.map(place, found, run)
+        return jax.tree.map(place, found._replace(history=history), run)
 
 
 class Loop(NamedTuple):
@@ -119,8 +122,9 @@ class Loop(NamedTuple):
         run = self.first(problem, shape, theta)
         file = None
         if self.checkpoint is not None:
-            known = (self._replace(callback=None, checkpoint=None), shape, theta)
-            told = digest((known, problem))
+            numbers = self.numbers | dict(steps=None)
+            known = self._replace(callback=None, checkpoint=None, numbers=numbers)
+            told = digest(((known, shape, theta), problem))
             file = _File(Path(self.checkpoint.path), max(1, round(self.checkpoint.every)), told)
             run = file.read(run)
             shape = eqx.combine(run.lists, shape)
@@ -273,8 +277,8 @@ class Loop(NamedTuple):
         small = float(run.values.size) <= self.numbers["rtol"] * float(run.first)
         if small and float(run.values.violation) <= self.numbers["ctol"]:
             return "converged"
-        steps, off = self.numbers["steps"], float(run.values.violation)
-        if int(run.step) < steps:
+        steps, off = int(run.step), float(run.values.violation)
+        if steps < self.numbers["steps"]:
             return ""
         unmet = f", and constraints are off by {off:.2g}" if off > self.numbers["ctol"] else ""
         return f"all {steps} steps used{unmet}"
@@ -303,7 +307,7 @@ def _covered(problem, shape, theta, values, multipliers, search):
 def _with_new_lists(problem, shape, theta, multipliers, search) -> tuple[AbstractShape, str]:
     """The shape with neighbours found anew at theta, and what is wrong with it."""
     try:
-        anew = _renewed(shape, theta, search)
+        anew = _quietly(renewed_with_room, shape, theta, search)
     except ValueError as error:
         return shape, f"neighbours could not be found anew: {error}"
     code = int(evaluated(problem.at(anew), theta, multipliers)[1].code)
@@ -325,14 +329,6 @@ def _is_only_far(surface: Discretization) -> bool:
         return set(np.asarray(surface.code).tolist()) <= {0, FAR}
     except ValueError:  # it has no operators
         return False
-
-
-def _renewed(shape: AbstractShape, theta, search: NeighborSearch) -> AbstractShape:
-    try:
-        return _quietly(shape.renewed, theta, search)
-    except ValueError:  # there may be no room
-        room = unchecked_surface(shape, theta).search(margin=2.0)
-        return _quietly(shape.renewed, theta, room)
 
 
 def _quietly(change: Callable, *args) -> AbstractShape:

@@ -56,7 +56,7 @@ def optimize_shape(
         optimizer: of optax: `optax.lbfgs()`, `optax.adam(1e-2)`, a chain.
         equalities: $h(S) = 0$, functions like the objective by their names, of numbers or arrays;
             best of size one, like `lambda s: js.volume(s) - 1`.
-        inequalities: $g(S) \le 0$, likewise.
+        inequalities: $g(S) \le 0$, likewise; -inf, as of a switched-off point, is met.
         project: takes parameters to the nearest that are allowed, at the start and after every
             step of a first-order method: one of `optax.projections`, say. L-BFGS is refused: its
             search along a line does not know of it.
@@ -74,7 +74,7 @@ def optimize_shape(
             preconditioner.
         callback: called with the `ShapeOptimization` so far after each step; True ends it.
         checkpoint: where all is written after every so many steps; if the file is there, the same
-            run goes on from it and ends in the same bits.
+            run, of more `steps` too, goes on from it and ends in the same bits.
         throw: raise where it cannot go on; if False, see `stopped`.
 
     Returns:

@@ -81,8 +81,8 @@ def taylor_remainders(
 
     Raises:
         TypeError: leaves that are not of a floating-point type; f that is not real and scalar.
-        ValueError: direction unlike x; values, derivatives or steps that are not finite, steps
-            that are not positive or fewer than two; traced arrays.
+        ValueError: direction unlike x, or zero; values, derivatives or steps that are not finite,
+            steps that are not positive or fewer than two; traced arrays.
 
     Example:
         >>> x = {"a": jnp.array([1.0, 2.0]), "b": jnp.array(0.5)}
@@ -104,6 +104,11 @@ def taylor_remainders(
     raise_at(not_positive(at), "step {i} is {v}, expected a positive number", at)
     if len(np.unique(at)) < 2:
         raise ValueError(f"{len(np.unique(at))} different steps, at least 2 are needed")
+    shifted = lambda step: jax.tree.map(
+        lambda a, v: a + jnp.asarray(step, a.dtype) * v, x, direction
+    )
+    if _same(x, shifted(at.max())):
+        raise ValueError("direction is zero, or so short that x is the same after all steps")
 
     kind = jax.eval_shape(f, x)
     if getattr(kind, "shape", None) != () or not jnp.issubdtype(kind.dtype, jnp.floating):
@@ -114,11 +119,12 @@ def taylor_remainders(
     size = lambda a, b: sum(np.sum(np.abs(p * q)) for p, q in zip(double(a), double(b)))
     derivative = float(sum(np.sum(p * q) for p, q in zip(double(gradient), double(direction))))
     finite(jnp.asarray(derivative), "derivative of f at x")
-    shifted = lambda step: jax.tree.map(
-        lambda a, v: a + jnp.asarray(step, a.dtype) * v, x, direction
-    )
     values = np.array([float(f(shifted(step))) for step in at])
     raise_at(~np.isfinite(values), "f(x + step direction) is {v} at step {at}", values, at=at)
     remainders = np.abs(values - float(value) - at * derivative)
     rounding = _ROUNDING * epsilon * (abs(float(value)) + size(gradient, x))
     return TaylorRemainders(at, remainders, derivative, float(rounding))
+
+
+def _same(a: PyTree, b: PyTree) -> bool:
+    return all(np.array_equal(*pair) for pair in zip(jax.tree.leaves(a), jax.tree.leaves(b)))

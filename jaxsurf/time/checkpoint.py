@@ -232,8 +232,19 @@ def written(path: Path, key: str, now: PyTree) -> None:
     os.replace(partial, path)
 
 
-def read_back(path: Path, key: str, like: Any, *, same_sizes: bool = True) -> Any:
-    """What was written: of the same run, with arrays as in `like`, or of other sizes."""
+def read_back(
+    path: Path,
+    key: str,
+    like: Any,
+    *,
+    same_sizes: bool = True,
+    run: str = "problem, initial state, times or settings",
+) -> Any:
+    """What was written: of the same run, with arrays as in `like`, or of other sizes.
+
+    Args:
+        run: what may differ in another.
+    """
     expected, structure = jax.tree.flatten(like)
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -247,7 +258,6 @@ def read_back(path: Path, key: str, like: Any, *, same_sizes: bool = True) -> An
     shapes = [[(size(leaf), np.asarray(leaf).dtype) for leaf in x] for x in (leaves, expected)]
     if found != key or shapes[0] != shapes[1]:
         raise ValueError(
-            f"{path} is a checkpoint of another run: problem, initial state, times or settings "
-            "differ. Remove it or choose another path"
+            f"{path} is a checkpoint of another run: {run} differ. Remove it or choose another path"
         )
     return jax.tree.unflatten(structure, leaves)

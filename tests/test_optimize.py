@@ -113,7 +113,7 @@ def test_far_from_the_constraint_it_has_not_converged():
             objective, radius, jnp.array(1.0), optimizer=LBFGS,
             equalities={"size": lambda s: size(s) - 2},
         )  # fmt: skip
-        assert found.converged and found.history["gradient"][-1] < 1e-3
+        assert found.converged and found.history["gradient"][-1] < 2e-3
         np.testing.assert_allclose(found.theta, np.sqrt(2), rtol=1e-4)
 
 
@@ -127,7 +127,9 @@ def test_a_fold_on_the_way_is_no_contradiction():
     twice = run(2)
     assert twice.converged
     np.testing.assert_allclose(twice.theta, 1, atol=1e-3)
-    with pytest.raises(js.OptimizationError, match="no step .* folds: the last good") as error:
+    with pytest.raises(
+        js.OptimizationError, match="farther along it the surface folds: the"
+    ) as error:
         run(10)
     kept = error.value.solution
     assert kept.equalities["volume"] > 0 and not np.asarray(kept.surface.code).any()

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
@@ -38,6 +39,12 @@ def weightless(multipliers: Multipliers) -> Multipliers:
     """Those with which nothing counts but the objective, for the same program."""
     nothing, mu = jax.tree.map(jnp.zeros_like, multipliers), multipliers.penalty
     return nothing._replace(penalty=jnp.full_like(mu, jnp.finfo(mu.dtype).tiny))
+
+
+def with_penalty(multipliers: Multipliers, factor: float) -> Multipliers:
+    """With so many times the penalty; no program is compiled for the product."""
+    mu = multipliers.penalty
+    return multipliers._replace(penalty=jnp.asarray(factor * np.asarray(mu), mu.dtype))
 
 
 class Values(NamedTuple):

@@ -15,10 +15,9 @@ import numpy as np
 import optax
 from jaxtyping import PyTree
 
-from ..discretization import Discretization
 from ..renew import NeighborSearch
 from ..time.checkpoint import Checkpoint, digest, read_back, written
-from .asked import FAR, ILL, refuse_start
+from .asked import ILL, is_only_far, refuse_start
 from .lagrangian import (
     Asked,
     Multipliers,
@@ -31,6 +30,7 @@ from .lagrangian import (
     kinds,
     started,
     weightless,
+    with_penalty,
 )
 from .outcome import COLUMNS, ShapeOptimization
 from .shape import AbstractShape, unchecked_surface, with_wear
@@ -116,7 +116,7 @@ class Loop(NamedTuple):
             surface = shape(theta)
         except ValueError:
             surface = unchecked_surface(shape, theta)
-            if not (renew and _is_only_far(surface)):
+            if not (renew and is_only_far(surface)):
                 raise
             shape = shape.renewed(theta, surface.search())
         search = surface.search() if renew else None
@@ -244,7 +244,7 @@ class Loop(NamedTuple):
         multipliers = run.values.forced
         wrong = now > self.numbers["ctol"]
         if wrong and solved and now > _FALLS * last:
-            multipliers = _with_penalty(multipliers, _GROWTH)
+            multipliers = with_penalty(multipliers, _GROWTH)
         # Under a projection they are not minimised alone.
         counts = solved or self.asked.project is None
         stalls = run.stalls + counts if wrong and now > _STAYS * last else np.array(0)
@@ -286,12 +286,9 @@ class Loop(NamedTuple):
 
     def ended(self, run: _Run) -> str:
         """Why it ends here, if it does."""
-        if (
-            _is_small(run, self.numbers["rtol"])
-            and float(run.values.violation) <= self.numbers["ctol"]
-        ):
-            return "converged"
         steps, off = self.numbers["steps"], float(run.values.violation)
+        if _is_small(run, self.numbers["rtol"]) and off <= self.numbers["ctol"]:
+            return "converged"
         if int(run.step) < steps:
             return ""
         unmet = f", and constraints are off by {off:.2g}" if off > self.numbers["ctol"] else ""
@@ -337,14 +334,6 @@ def _halved(run: _Run, ill: str) -> str:
     return f"{why}: the last good shape is kept"
 
 
-def _is_only_far(surface: Discretization) -> bool:
-    """Whether nothing is wrong with a surface but its lists."""
-    try:
-        return set(np.asarray(surface.code).tolist()) <= {0, FAR}
-    except ValueError:  # it has no operators
-        return False
-
-
 def _renewed(shape: AbstractShape, theta, search: NeighborSearch) -> AbstractShape:
     try:
         return _quietly(shape.renewed, theta, search)
@@ -376,12 +365,6 @@ def _seen_again(problem: Problem, run: _Run, optimizer) -> _Run:
         else:
             state = (head._replace(updates=past.gradient), *state[1:])
     return run._replace(values=values, state=state)
-
-
-def _with_penalty(multipliers: Multipliers, share: float) -> Multipliers:
-    """With so much of the penalty: no program is compiled for a product."""
-    mu = multipliers.penalty
-    return multipliers._replace(penalty=jnp.asarray(share * np.asarray(mu), mu.dtype))
 
 
 def _is_small(run: _Run, share) -> bool:

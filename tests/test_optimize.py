@@ -87,6 +87,54 @@ def test_least_area_at_fixed_volume_is_a_ball_and_compiles_no_step():
     np.testing.assert_allclose(larger.theta, np.log(1.5) / 3, atol=2e-3)
 
 
+ALL_AXES = jnp.array([1.3, 1.0, 0.8])
+
+
+def test_far_from_the_constraint_it_has_not_converged():
+    """Most volume for an area, from three times the size: a penalty's gradient is no scale.
+
+    The objective is -4.19, not the -0.37 of a needle where the constraint does not press.
+    """
+    limit = {"area": lambda s: s.areas.sum() - 4 * np.pi}
+    volume = lambda s: -js.volume(s)
+    shape = js.MappedShape(scaled, ball(300))
+    for penalty in (None, 1e3):
+        found = js.optimize_shape(
+            volume, shape, 3 * ALL_AXES, optimizer=LBFGS, inequalities=limit, penalty=penalty,
+            throw=False,
+        )  # fmt: skip
+        at_rest = found.history["gradient"][-1] < 1e-2
+        assert found.converged == at_rest and (at_rest or "folds" in found.stopped), found
+        assert penalty or found.converged
+    # With the radius alone there is no gradient of the objective at the start, or anywhere.
+    radius = js.MappedShape(lambda x, r: r * x, ball())
+    for objective in (lambda s: (size(s) - 1) ** 2, lambda s: 0 * size(s)):
+        found = js.optimize_shape(
+            objective, radius, jnp.array(1.0), optimizer=LBFGS,
+            equalities={"size": lambda s: size(s) - 2},
+        )  # fmt: skip
+        assert found.converged and found.history["gradient"][-1] < 2e-3
+        np.testing.assert_allclose(found.theta, np.sqrt(2), rtol=1e-4)
+
+
+def test_a_fold_on_the_way_is_no_contradiction():
+    """A ball of given volume from twice and ten times its size: there, or the fold is told."""
+    left = {"volume": lambda s: js.volume(s) - 4 * np.pi / 3}
+    run = lambda factor, **options: js.optimize_shape(
+        lambda s: s.areas.sum(), js.MappedShape(scaled, ball(300)), factor * ALL_AXES,
+        optimizer=LBFGS, equalities=left, **options,
+    )  # fmt: skip
+    twice = run(2)
+    assert twice.converged
+    np.testing.assert_allclose(twice.theta, 1, atol=1e-3)
+    with pytest.raises(
+        js.OptimizationError, match="farther along it the surface folds: the"
+    ) as error:
+        run(10)
+    kept = error.value.solution
+    assert kept.equalities["volume"] > 0 and not np.asarray(kept.surface.code).any()
+
+
 def test_steps_of_a_given_length_meet_constraints():
     """Without a penalty that grows beyond all bounds, since their violations do not tell of it."""
     found = axes_found(optax.adam(1e-2), steps=1_000)

@@ -11,6 +11,7 @@ import numpy as np
 import optax
 
 from ..arguments import instance, traced_call
+from ..discretization import Discretization
 from ..time.checkpoint import Checkpoint
 from .lagrangian import CROSSED, Values
 from .outcome import COLUMNS
@@ -72,6 +73,14 @@ def check_projection(project: Callable | None, optimizer, theta) -> None:
             "project with L-BFGS: its search along a line does not know of it; take a method of "
             "first order, optax.adam(1e-2) say, or inequalities"
         )
+
+
+def is_only_far(surface: Discretization) -> bool:
+    """Whether nothing is wrong with a surface but its lists."""
+    try:
+        return set(np.asarray(surface.code).tolist()) <= {0, FAR}
+    except ValueError:  # it has no operators
+        return False
 
 
 def refuse_start(theta, values: Values) -> None:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
@@ -32,6 +33,18 @@ class Multipliers(NamedTuple):
     equalities: dict[str, Array]
     inequalities: dict[str, Array]
     penalty: Array
+
+
+def weightless(multipliers: Multipliers) -> Multipliers:
+    """Those with which nothing counts but the objective, for the same program."""
+    nothing, mu = jax.tree.map(jnp.zeros_like, multipliers), multipliers.penalty
+    return nothing._replace(penalty=jnp.full_like(mu, jnp.finfo(mu.dtype).tiny))
+
+
+def with_penalty(multipliers: Multipliers, factor: float) -> Multipliers:
+    """With so many times the penalty; no program is compiled for the product."""
+    mu = multipliers.penalty
+    return multipliers._replace(penalty=jnp.asarray(factor * np.asarray(mu), mu.dtype))
 
 
 class Values(NamedTuple):
@@ -72,6 +85,18 @@ class Violation(eqx.Module):
         off = [h(surface, *args) for h in self.equalities.values()]
         off += [jnp.maximum(0, g(surface, *args)) for g in self.inequalities.values()]
         return sum(jnp.sum(x**2) for x in off) / 2
+
+
+def first_penalty(values: Values) -> Array:
+    """Ten objectives, or 10: less where constraints are so far off that they cost twenty with less.
+
+    As ALGENCAN begins. One that drowns the objective takes the straightest way to the constraints,
+    which may lead through folds; with much less, to give one up may cost less than to keep it.
+    """
+    off = [*values.equalities.values()]
+    off += [jnp.maximum(0, g) for g in values.inequalities.values()]
+    amount = sum(jnp.sum(x**2) for x in off)
+    return 10 * jnp.maximum(1, jnp.abs(values.objective)) / jnp.maximum(1, amount / 4)
 
 
 class Asked(NamedTuple):

@@ -15,9 +15,8 @@ import numpy as np
 import optax
 from jaxtyping import PyTree
 
-from ..discretization import Discretization
 from ..time.checkpoint import Checkpoint, digest, read_back, written
-from .asked import FAR, ILL, refuse_start
+from .asked import ILL, is_only_far, refuse_start
 from .lagrangian import (
     Asked,
     Multipliers,
@@ -26,21 +25,26 @@ from .lagrangian import (
     Violation,
     direction,
     evaluated,
+    first_penalty,
     kinds,
     started,
+    weightless,
+    with_penalty,
 )
 from .outcome import COLUMNS, ShapeOptimization
 from .shape import AbstractShape, renewed_with_room, unchecked_surface, with_wear
 
 # A step that fails is halved so often.
 _HALVINGS = 12
-# Forces are corrected after so many steps, or when the gradient has fallen to a share of its first.
+# Forces are corrected after so many steps, or when the gradient has fallen to a share of the scale.
 _INNER, _GOAL = 20, 0.1
 # A violation that does not fall to this share makes the penalty grow by that factor.
 _FALLS, _GROWTH = 0.25, 4.0
 # One that stays above this share, so many times in a row or at the end, is minimised alone, in so
 # many steps: if it stays then too, constraints contradict each other.
 _STAYS, _STALLS, _ALONE = 0.9, 8, 50
+# Why there is no step where nothing is wrong with those that were tried.
+_BOTTOM = "no step along the search lowers the objective"
 # An objective that has grown so much has run away.
 _RUN_AWAY = 1e3
 
@@ -53,7 +57,8 @@ class _Run(NamedTuple):
         theta, state: parameters, and what the optimiser remembers.
         multipliers, values: forces, and what is seen at theta.
         lists: the arrays of the shape.
-        first: norm of the first gradient.
+        first: size of the first gradient of the objective alone.
+        scale: the same, or what it was when forces were corrected last, if that is larger.
         goal: share of it at which the forces are corrected.
         since: steps since they were.
         violation: what it was then.
@@ -68,6 +73,7 @@ class _Run(NamedTuple):
     values: Values
     lists: PyTree
     first: Any
+    scale: Any
     goal: Any
     since: Any
     violation: Any
@@ -113,7 +119,7 @@ class Loop(NamedTuple):
             surface = shape(theta)
         except ValueError:
             surface = unchecked_surface(shape, theta)
-            if not (renew and _is_only_far(surface)):
+            if not (renew and is_only_far(surface)):
                 raise
             shape = shape.renewed(theta, surface.search())
         search = surface.search() if renew else None
@@ -156,15 +162,15 @@ class Loop(NamedTuple):
             if not x.size:
                 raise ValueError(f"constraint {name!r} returns shape {x.shape}: no numbers")
         nothing = lambda some: {name: jnp.zeros(x.shape, x.dtype) for name, x in some.items()}
-        given = self.numbers["penalty"]
-        mu = jnp.asarray(10 if given is None else given, f.dtype)
-        multipliers = Multipliers(nothing(h), nothing(g), mu)
-        theta, values = evaluated(problem, theta, multipliers)
+        multipliers = Multipliers(nothing(h), nothing(g), jnp.ones((), f.dtype))
+        theta, values = evaluated(problem, theta, weightless(multipliers))
         refuse_start(theta, values)
-        if given is None and (h or g):
-            mu = 10 * jnp.maximum(1, jnp.abs(values.objective))
-            multipliers = multipliers._replace(penalty=mu)
+        first, given = np.asarray(values.size), self.numbers["penalty"]
+        mu = first_penalty(values) if given is None else jnp.asarray(given, f.dtype)
+        multipliers = multipliers._replace(penalty=mu)
+        if h or g:
             theta, values = evaluated(problem, theta, multipliers)
+            refuse_start(theta, values)
         rows = self.numbers["steps"] + 1
         history = {name: np.full(rows, np.nan) for name in COLUMNS}
         for name, x in (values.equalities | values.inequalities).items():
@@ -172,7 +178,7 @@ class Loop(NamedTuple):
         zero = np.array(0)
         run = _Run(
             zero, theta, started(self.optimizer, theta), multipliers, values,
-            eqx.filter(shape, eqx.is_array), values.size, np.array(_GOAL), zero,
+            eqx.filter(shape, eqx.is_array), first, first, np.array(_GOAL), zero,
             np.array(np.inf), zero, history,
         )  # fmt: skip
         _note(run, refused=0, renewed=0, rebuilt=0)
@@ -186,15 +192,7 @@ class Loop(NamedTuple):
             theta, values = evaluated(problem, theta, run.multipliers, *updates)
             return _covered(problem, shape, theta, values, run.multipliers, search), theta
 
-        ills: list[str] = []
-
-        def beyond(theta):
-            """A search along a line goes on to where there are other parts."""
-            (_, values, ill), _ = look(theta)
-            ills.extend(filter(None, [ill]))
-            return values
-
-        updates, state = direction(self.optimizer, beyond, run.theta, run.values, run.state)
+        updates, state, ahead = self.searched(look, run)
         for refused in range(_HALVINGS + 1):
             (covering, values, ill), theta = look(run.theta, updates, 0.5**refused)
             anew = covering
@@ -211,22 +209,36 @@ class Loop(NamedTuple):
         )
         if renewed or rebuilt:
             run = run._replace(lists=eqx.filter(shape, eqx.is_array))
-        small = float(values.size) <= float(run.goal) * float(run.first)
+        small = _is_small(run, run.goal)
         corrected = bool(self.asked.equalities or self.asked.inequalities) and (
             still or small or int(run.since) >= _INNER
         )
         if corrected:
-            run = self.corrected(run, solved=still or small)
+            run = self.corrected(problem.at(shape), run, solved=still or small)
         if renewed or rebuilt or corrected:
             run = _seen_again(problem.at(shape), run, self.optimizer)
-        elif still:
-            why = "no step along the search lowers the objective"
-            if ills:
-                why += f", and farther along it {ills[-1]}: the last good shape is kept"
+        # Other forces are no way round what is ahead: there the Lagrangian is not least.
+        if still and not (renewed or rebuilt) and (ahead or not corrected):
+            why = _BOTTOM
+            if ahead:
+                why += f", and farther along it {ahead}: the last good shape is kept"
         _note(run, refused=refused, renewed=renewed, rebuilt=rebuilt)
         return run, shape, why
 
-    def corrected(self, run: _Run, solved: bool) -> _Run:
+    def searched(self, look, run: _Run) -> tuple[PyTree, Any, str]:
+        """Updates, the state of the optimiser, and what is wrong with the nearest it has tried."""
+        ills = [""]
+
+        def beyond(theta):
+            """A search along a line goes on to where there are other parts."""
+            (_, values, ill), there = look(theta)
+            ills.extend([] if _same(run.theta, there) else [ill])
+            return values
+
+        updates, state = direction(self.optimizer, beyond, run.theta, run.values, run.state)
+        return updates, state, ills[-1]
+
+    def corrected(self, problem, run: _Run, solved: bool) -> _Run:
         """With forces that the constraints were met with, and the penalty that this asks for.
 
         A violation tells of penalty and constraints only where the Lagrangian was minimised: steps
@@ -236,14 +248,15 @@ class Loop(NamedTuple):
         multipliers = run.values.forced
         wrong = now > self.numbers["ctol"]
         if wrong and solved and now > _FALLS * last:
-            multipliers = multipliers._replace(penalty=_GROWTH * multipliers.penalty)
+            multipliers = with_penalty(multipliers, _GROWTH)
         # Under a projection they are not minimised alone.
         counts = solved or self.asked.project is None
         stalls = run.stalls + counts if wrong and now > _STAYS * last else np.array(0)
         goal = np.maximum(self.numbers["rtol"], _GOAL * run.goal)
+        _, alone = evaluated(problem, run.theta, weightless(multipliers))
         return run._replace(
             multipliers=multipliers, violation=np.array(now), stalls=stalls, goal=goal,
-            since=np.array(0),
+            scale=np.maximum(run.first, alone.size), since=np.array(0),
         )  # fmt: skip
 
     def contradiction(self, shape, run: _Run, last: bool) -> str:
@@ -254,30 +267,32 @@ class Loop(NamedTuple):
             return ""
         text = f"constraints are not met: a violation of {off:.3g} has stayed"
         if self.asked.project is None:
-            if self.is_lessened(shape, run.theta):
+            alone, failed = self.alone(shape, run.theta)
+            violation = alone.history["objective"]
+            if violation[-1] <= _STAYS**2 * violation[0]:
                 return ""
+            if failed and alone.stopped != _BOTTOM:
+                return f"{text}; where they alone are minimised, {alone.stopped}"
             text += ", and is not lessened where they alone count either"
         elif not often:
             return ""
         return f"{text}; they contradict each other, or what the shape can do"
 
-    def is_lessened(self, shape, theta) -> bool:
-        """Whether constraints come nearer where they alone are minimised."""
+    def alone(self, shape, theta) -> tuple[ShapeOptimization, bool]:
+        """What is found where constraints alone are minimised."""
         met = lambda now: bool(now.objective <= self.numbers["ctol"] ** 2 / 2)
         off = Violation(self.asked.equalities, self.asked.inequalities)
         alone = self._replace(
             asked=Asked(off, {}, {}, None), optimizer=optax.lbfgs(), callback=met,
             checkpoint=None, numbers=self.numbers | dict(steps=_ALONE),
         )  # fmt: skip
-        violation = alone.run(shape, theta)[0].history["objective"]
-        return bool(violation[-1] <= _STAYS**2 * violation[0])
+        return alone.run(shape, theta)
 
     def ended(self, run: _Run) -> str:
         """Why it ends here, if it does."""
-        small = float(run.values.size) <= self.numbers["rtol"] * float(run.first)
-        if small and float(run.values.violation) <= self.numbers["ctol"]:
-            return "converged"
         steps, off = int(run.step), float(run.values.violation)
+        if _is_small(run, self.numbers["rtol"]) and off <= self.numbers["ctol"]:
+            return "converged"
         if steps < self.numbers["steps"]:
             return ""
         unmet = f", and constraints are off by {off:.2g}" if off > self.numbers["ctol"] else ""
@@ -323,14 +338,6 @@ def _halved(run: _Run, ill: str) -> str:
     return f"{why}: the last good shape is kept"
 
 
-def _is_only_far(surface: Discretization) -> bool:
-    """Whether nothing is wrong with a surface but its lists."""
-    try:
-        return set(np.asarray(surface.code).tolist()) <= {0, FAR}
-    except ValueError:  # it has no operators
-        return False
-
-
 def _quietly(change: Callable, *args) -> AbstractShape:
     """Without warnings: what bends within one stencil was told of the first surface."""
     with warnings.catch_warnings():
@@ -354,6 +361,17 @@ def _seen_again(problem: Problem, run: _Run, optimizer) -> _Run:
         else:
             state = (head._replace(updates=past.gradient), *state[1:])
     return run._replace(values=values, state=state)
+
+
+def _is_small(run: _Run, share) -> bool:
+    """Whether the gradient is a share of the objective's.
+
+    That of a penalty tells how far off constraints were, not what is stationary: it counts only
+    where the objective has none.
+    """
+    first, scale = float(run.history["gradient"][0]), float(run.scale)
+    nil = scale <= np.finfo(run.scale.dtype).eps * first
+    return float(run.values.size) <= float(share) * (first if nil else scale)
 
 
 def _note(run: _Run, **others) -> None:

@@ -64,10 +64,12 @@ def optimize_shape(
             other numbers in functions of the same code.
         steps: at most.
         rtol: it has converged where the gradient of the Lagrangian, less what a projection takes of
-            it, is this share of its first,
+            it, is this share of the objective's, at the start or where multipliers were corrected
+            last, whichever is larger,
         ctol: and constraints are kept to this.
         penalty: $\mu$ at first, in units of the objective over those of a constraint squared;
-            if None ten times the first objective, at least 10: much less, and to give a
+            if None ten times the first objective, at least 10, and less where constraints are so
+            far off that they cost twenty objectives with less: much less yet, and to give a
             constraint up may cost less than to keep it.
         renew: find neighbours anew, and points where there are other parts. If False they are
             those of `shape`, and known to the program, as `js.solve` asks for without a

@@ -39,7 +39,8 @@ def optimize_shape(
     r"""Parameters that minimise a function of a surface, under constraints on it.
 
     Constraints are met by an augmented Lagrangian: multipliers that are corrected whenever its
-    gradient has fallen tenfold, or every 20 steps, and a penalty that grows fourfold where that
+    gradient has fallen to a tenth of the objective's, then a hundredth and so on, or every 20
+    steps, and a penalty that grows fourfold where that
     gradient has fallen and the violation has not. One that stays is minimised alone: if it stays
     then too, constraints contradict each other (not asked under a projection). Steps after which
     the surface folds or passes through itself, or a number is not finite, are halved. Neighbours

@@ -39,15 +39,15 @@ def optimize_shape(
     r"""Parameters that minimise a function of a surface, under constraints on it.
 
     Constraints are met by an augmented Lagrangian: multipliers that are corrected whenever its
-    gradient has fallen tenfold, or every 20 steps, and a penalty that grows fourfold where that
-    gradient has fallen and the violation has not. One that stays is minimised alone: if it stays
-    then too, constraints contradict each other (not asked under a projection). Steps after which
-    the surface folds or passes through itself, or a number is not finite, are halved. Neighbours
-    are found anew once the surface was sheared or stretched by about an eighth
-    (`AbstractShape.renewed`), and points of level sets, and of maps with `onto`, spread evenly
-    again; points are chosen anew where a level set in `bounds` has other parts
-    (`js.LevelSetShape`); the optimiser keeps its state, and nothing is compiled again. Only L-BFGS
-    begins again where the points that are chosen cannot follow back to the step before.
+    gradient has fallen to a tenth of the objective's, then a hundredth and so on, or every 20
+    steps, and a penalty that grows fourfold where that gradient has fallen and the violation has
+    not. One that stays is minimised alone: if it stays then too, constraints contradict each other
+    (not asked under a projection). Steps after which the surface folds or passes through itself, or
+    a number is not finite, are halved. Neighbours are found anew once the surface was sheared or
+    stretched by about an eighth (`AbstractShape.renewed`), and points of level sets, and of maps
+    with `onto`, spread evenly again; points are chosen anew where a level set in `bounds` has other
+    parts (`js.LevelSetShape`); the optimiser keeps its state, and nothing is compiled again. Only
+    L-BFGS begins again where the points that are chosen cannot follow back to the step before.
 
     Args:
         objective: $f(S)$, of a `Discretization` and `args`; returns a number.

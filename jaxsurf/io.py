@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -19,13 +19,18 @@ from jaxsurf.failures import needs_values, not_finite, raise_at, warn
 from jaxsurf.formats.by_suffix import contents_of
 from jaxsurf.formats.contents import Contents
 from jaxsurf.formats.held import check_name, columns_of, in_space
+from jaxsurf.formats.normals import (
+    compare_normals,
+    fitted_normals,
+    own_normals,
+    turned_to,
+    unit_normals,
+)
 from jaxsurf.formats.through_meshio import meshio
 from jaxsurf.normals import estimate_normals
 from jaxsurf.series import Frame, frames_of
 from jaxsurf.shapes.cleaning import clean_mesh, merge_equal
-from jaxsurf.shapes.meshes import TriangleMesh
 from jaxsurf.shapes.resampling import sample_mesh
-from jaxsurf.shapes.smooth import fit_surface
 
 # What a cloud carries besides points and normals goes into files under these names.
 _OWN = ("boundary", "active", "spacing")
@@ -41,6 +46,7 @@ def read(
     seed: int = 0,
     columns: str | None = None,
     faces: bool = True,
+    normals: bool = True,
     largest_part: bool = False,
 ) -> PointCloud:
     """Point cloud from a triangle mesh or a list of points.
@@ -48,14 +54,16 @@ def read(
     OBJ, OFF and XYZ (columns `x y z`, or `x y` for curves in the plane; others must be named) need
     no other package; PLY, STL, VTK and VTU need `pip install 'jaxsurf[files]'`.
 
-    Normals are those in the file, scaled to length one. A mesh without them gives the side they
-    point to by the order of its corners, and their direction comes from local polynomial fits
-    of its vertices (`smooth=True`) or from the triangles around (first-order accurate). A list
-    of points without normals gets those of `estimate_normals`.
+    Normals are those in the file, scaled to length one. A mesh without them, and new points on one,
+    have normals to the side that the order of its corners tells, or normals in the file where these
+    differ; their direction comes from local polynomial fits of the vertices (`smooth=True`) or from
+    the triangles around (first-order accurate, as those in files mostly are). A list of points
+    without normals gets those of `estimate_normals`.
 
     Stated in a warning, with how many: polygons cut into triangles that share their first
     corner, vertices at equal positions merged (always so in STL), vertices that no triangle
-    uses and triangles without area left out, triangles turned round to agree with the others.
+    uses and triangles without area left out, triangles turned round to agree with the others, or
+    with normals in the file; and normals in the file that are no better than the triangles'.
 
     Args:
         path: file; its suffix tells the format.
@@ -70,6 +78,7 @@ def read(
             (`# x y z nx ny nz`, as `write` leaves it), or else two or three coordinates: more
             columns without names are an error, as unit vectors may be colours too.
         faces: False takes the vertices of a mesh as a list of points, whatever its faces.
+        normals: False takes none from the file.
         largest_part: leave out faces until no edge has more than two, see `clean_mesh`.
 
     Returns:
@@ -100,9 +109,12 @@ def read(
         real(spacing, "spacing", above=0)
     whole(degree, "degree", least=1)
     whole(seed, "seed", least=0)
-    for name, value in (("smooth", smooth), ("faces", faces), ("largest_part", largest_part)):
+    flags = dict(smooth=smooth, faces=faces, normals=normals, largest_part=largest_part)
+    for name, value in flags.items():
         instance(value, (bool, np.bool_), name)
     contents = contents_of(path, columns)
+    if not normals:
+        contents = replace(contents, normals=None)
     try:
         notes = list(contents.notes)
         triangles = _triangulate(contents, notes) if faces else np.empty((0, 3), np.int64)
@@ -113,19 +125,17 @@ def read(
         mesh, kept = clean_mesh(
             contents.points, triangles, name=str(path), largest_part=largest_part
         )
+        own = None if contents.normals is None else own_normals(contents, kept)
+        if own is not None:
+            mesh = turned_to(path, mesh, own)
         if n is not None or spacing is not None:
             return sample_mesh(mesh, n=n, spacing=spacing, smooth=smooth, degree=degree, seed=seed)
-        if contents.normals is not None:
-            first, group = merge_equal(contents.points)
-            total = np.zeros((len(first), 3))
-            np.add.at(total, group, contents.normals)
-            normals = _unit(total[group[kept]])
+        if own is None:
+            own = fitted_normals(path, mesh, degree) if smooth else mesh.vertex_normals
         elif smooth:
-            normals = _fitted_normals(path, mesh, degree)
-        else:
-            normals = mesh.vertex_normals
+            compare_normals(path, mesh, own, degree)
         boundary = None if mesh.closed else jnp.asarray(mesh.border_vertices)
-        return PointCloud(jnp.asarray(mesh.vertices), jnp.asarray(normals), boundary=boundary)
+        return PointCloud(jnp.asarray(mesh.vertices), jnp.asarray(own), boundary=boundary)
     except ValueError as error:
         text = str(error)
         named = text if text.startswith(str(path)) else f"{path}: {text}"
@@ -158,7 +168,7 @@ def _from_points(contents: Contents, n, spacing, degree: int) -> PointCloud:
     again = first[group] != np.arange(len(names))
     raise_at(again, "points {v} and {i} coincide", names[first[group]], points=names)
     if normals is not None:
-        normals = _unit(normals, on)
+        normals = unit_normals(normals, on)
         # Plane curves are kept in space by formats that know nothing else.
         if points.shape[1] == 3 and not points[on, 2].any() and not normals[on, 2].any():
             points, normals = points[:, :2], normals[:, :2]
@@ -177,31 +187,6 @@ def _own(name: str, value: np.ndarray) -> Array:
     if not np.isin(value, (0, 1)).all():
         raise ValueError(f"field {name!r} is no mask: it holds other numbers than 0 and 1")
     return jnp.asarray(value, bool)
-
-
-def _unit(normals: np.ndarray, on: np.ndarray | bool = True) -> np.ndarray:
-    length = np.linalg.norm(normals, axis=1)
-    bad = on & ~(np.isfinite(length) & (length > 0))
-    length = np.where(on, length, 1)
-    raise_at(bad, "normal {i} is {v}, expected a direction", normals)
-    return normals / length[:, None]
-
-
-def _fitted_normals(path, mesh: TriangleMesh, degree: int) -> np.ndarray:
-    need = math.comb(degree + 2, 2) + 2
-    if len(mesh.vertices) < need:
-        raise ValueError(
-            f"{len(mesh.vertices)} vertices, normals of degree {degree} need at least"
-            f" {need}: lower the degree or take smooth=False"
-        )
-    _, normals, used = fit_surface(mesh.vertices, mesh.vertex_normals, mesh, degree)
-    low = np.count_nonzero(used < degree)
-    if low:
-        warn(
-            f"{path}: the neighbours of {low} of {len(used)} vertices allow no fit of degree"
-            f" {degree}; the lowest degree used for a normal is {used.min()}"
-        )
-    return normals
 
 
 def read_fields(path: str | Path, *, columns: str | None = None) -> dict[str, np.ndarray]:

@@ -201,6 +201,17 @@ def test_plates_without_a_rim_face_away_from_each_other(thickness):
     assert np.abs(z - np.repeat([-1, 1], 400)).max() < 1e-12
 
 
+@pytest.mark.parametrize("gap", [4.0, 5.0])
+def test_plates_that_face_the_same_way_are_told_apart(gap):
+    """Fits near their edges took points of the other plate: normals were up to 18 degrees off."""
+    a = np.stack(np.meshgrid(np.arange(30), np.arange(30)), -1).reshape(-1, 2)
+    points = np.r_[np.c_[a, np.zeros(900)], np.c_[a, np.full(900, gap)]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        z = np.asarray(estimate_normals(points))[:, 2]
+    assert np.abs(np.abs(z) - 1).max() < 1e-12
+
+
 def test_flat_sheet_is_accepted():
     a = np.random.default_rng(0).uniform(size=(500, 2))
     normals = estimate_normals(np.c_[a, np.zeros(500)], degree=2)

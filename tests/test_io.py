@@ -144,6 +144,42 @@ def test_normals_of_a_file_are_kept(tmp_path):
     assert np.allclose(read(ply).normals, expected)
 
 
+def test_normals_of_a_file_beside_the_triangles(tmp_path):
+    """They were of first order, or of the other side once resampled, without a word."""
+    mesh = ball_mesh(400)
+    weighted = mesh.vertex_normals
+
+    def written(name, normals, triangles):
+        lines = [f"vn {x} {y} {z}\n" for x, y, z in normals.tolist()]
+        lines += [
+            "f " + " ".join(f"{i + 1}//{i + 1}" for i in t) + "\n" for t in triangles.tolist()
+        ]
+        return write_obj(tmp_path / name, mesh.vertices, [], "".join(lines))
+
+    plain = written("plain.obj", weighted, mesh.triangles)
+    with pytest.warns(UserWarning, match=r"normals in the file are .* rad off .* normals=False"):
+        cloud = read(plain)
+    np.testing.assert_allclose(cloud.normals, weighted, atol=1e-12)
+    fitted = read(plain, normals=False).normals
+    assert np.abs(fitted - mesh.vertices).max() < 0.2 * np.abs(weighted - mesh.vertices).max()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read(written("exact.obj", mesh.vertices, mesh.triangles))
+        read(plain, smooth=False)
+    turned = written("turned.obj", mesh.vertices, mesh.triangles[:, ::-1])
+    for sizes in ({}, {"n": 300}):
+        with pytest.warns(UserWarning, match="400 of 400 normals point to the other side"):
+            cloud = read(turned, **sizes)
+        assert float(jnp.sum(cloud.points * cloud.normals, axis=1).min()) > 0.9
+
+
+def test_a_list_with_commas_says_what_is_expected(tmp_path):
+    path = tmp_path / "a.xyz"
+    path.write_text("1,2,3\n4,5,6\n")
+    with pytest.raises(ValueError, match="blanks between them are expected"):
+        read(path)
+
+
 def test_stl_corners_are_merged_and_stated(tmp_path):
     mesh = ball_mesh(100)
     path = tmp_path / "ball.stl"

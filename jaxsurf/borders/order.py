@@ -147,7 +147,10 @@ def _links(points, names) -> list[list[int]]:
             links[j].append(i)
     for i in [i for i, linked in enumerate(links) if not linked]:
         if not _insert(i, near[i][close_by[i]], points, links):
-            raise ValueError(f"border point {names[i]} has no neighbour along the border")
+            raise ValueError(
+                f"border point {names[i]} has no neighbour along the border: mark all points "
+                "there, and no inner ones (of uneven points js.detect_boundary may name some)"
+            )
     return links
 
 

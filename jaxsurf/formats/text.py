@@ -66,7 +66,8 @@ def _from_corners(corners, directions, n):
     if corners[:, 0].min() < 0 or corners[:, 0].max() >= n:
         return None  # the faces themselves are about to be refused
     total = np.zeros((n, 3))
-    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    with np.errstate(invalid="ignore"):  # of length 0: refused where they are used
+        unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     pairs = np.unique(corners, axis=0)
     np.add.at(total, pairs[:, 0], unit[pairs[:, 1]])
     return total
@@ -119,7 +120,11 @@ def off(path: Path) -> Contents:
 def xyz(path: Path, columns: str | None = None) -> Contents:
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         text = file.read()
-    rows = np.loadtxt(io.StringIO(text), comments="#", ndmin=2)
+    try:
+        rows = np.loadtxt(io.StringIO(text), comments="#", ndmin=2)
+    except ValueError as error:
+        expected = "numbers with blanks between them are expected, and # before titles"
+        raise ValueError(f"{error}; {expected}") from None
     count = rows.shape[1]
     if columns is None:
         # A first comment that names every column, as `write` leaves it.

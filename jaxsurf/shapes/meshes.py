@@ -14,6 +14,9 @@ from scipy.sparse import csgraph
 from jaxsurf.arguments import in_range, on_host, shaped
 from jaxsurf.failures import not_finite, raise_at
 
+# Cosine of the turn between two triangles that makes an edge a sharp one: 40 degrees.
+_CREASE = 0.766
+
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
@@ -93,22 +96,50 @@ class TriangleMesh:
         return float(np.sum(corner * self._area_vectors) / 3)
 
     @cached_property
+    def _corner_angles(self) -> Float[Array, "m 3"]:
+        """The angle at every corner; 0 in triangles without area."""
+        corners = self.vertices[self.triangles]
+        sides = np.roll(corners, -1, axis=1) - corners, np.roll(corners, -2, axis=1) - corners
+        angle = np.arctan2(2 * self.areas[:, None], np.sum(sides[0] * sides[1], axis=2))
+        return np.where(self.areas[:, None] > 0, angle, 0)
+
+    @cached_property
+    def _face_normals(self) -> Float[Array, "m 3"]:
+        """Unit normals of the triangles; 0 without area."""
+        area = self.areas[:, None]
+        return np.where(area > 0, self._area_vectors / np.where(area > 0, area, 1), 0)
+
+    @cached_property
     def vertex_normals(self) -> Float[Array, "n 3"]:
         """Unit normals at the vertices: those of the triangles around, weighted by angle.
 
         Only first-order accurate on irregular meshes; NaN at a vertex of no triangle.
         """
-        corners = self.vertices[self.triangles]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            unit = self._area_vectors / self.areas[:, None]
-            total = np.zeros_like(self.vertices)
-            for i in range(3):
-                a = corners[:, (i + 1) % 3] - corners[:, i]
-                b = corners[:, (i + 2) % 3] - corners[:, i]
-                angle = np.arctan2(2 * self.areas, np.sum(a * b, axis=1))
-                share = np.where(self.areas[:, None] > 0, angle[:, None] * unit, 0)
-                np.add.at(total, self.triangles[:, i], share)
+        total = np.zeros_like(self.vertices)
+        for vertices, angle in zip(self.triangles.T, self._corner_angles.T):
+            np.add.at(total, vertices, angle[:, None] * self._face_normals)
+        with np.errstate(invalid="ignore"):
             return total / np.linalg.norm(total, axis=1, keepdims=True)
+
+    @cached_property
+    def corner_normals(self) -> Float[Array, "m 3 3"]:
+        """Unit normals at the corners of each triangle: as at vertices, of what turns little.
+
+        Triangles around whose normals are more than 40 degrees off its own, beyond a sharp edge, do
+        not count.
+        """
+        corners = np.arange(self.triangles.size)
+        at = sparse.csr_array((np.ones(corners.size), (corners, self.triangles.ravel())))
+        pairs = (at @ at.T).tocoo()
+        one, other = pairs.coords
+        normal = self._face_normals
+        smooth = np.sum(normal[one // 3] * normal[other // 3], axis=1) > _CREASE
+        one, other = one[smooth], other[smooth]
+        shares = self._corner_angles.ravel()[other, None] * normal[other // 3]
+        total = np.stack([np.bincount(one, column, corners.size) for column in shares.T], axis=1)
+        with np.errstate(invalid="ignore"):
+            total = total / np.linalg.norm(total, axis=1, keepdims=True)
+        return total.reshape(-1, 3, 3)
 
     @cached_property
     def border_edges(self) -> Int[Array, "b 2"]:
@@ -149,9 +180,13 @@ class TriangleMesh:
         self, triangle: Int[Array, " q"], bary: Float[Array, "q 3"]
     ) -> Float[Array, "q 3"]:
         """Vertex normals carried linearly into triangles, at barycentric coordinates `(q, 3)`."""
-        corner = self.vertex_normals[self.triangles[triangle]]
-        normal = np.einsum("qi,qij->qj", bary, corner)
-        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        return _carried(bary, self.vertex_normals[self.triangles[triangle]])
+
+    def creased_normals_at(
+        self, triangle: Int[Array, " q"], bary: Float[Array, "q 3"]
+    ) -> Float[Array, "q 3"]:
+        """The same of `corner_normals`: those of flat faces are theirs up to sharp edges."""
+        return _carried(bary, self.corner_normals[triangle])
 
     @cached_property
     def border_loops(self) -> list[Int[Array, " l"]]:
@@ -176,6 +211,11 @@ class TriangleMesh:
         """Mean length of the edges."""
         a, b = self.vertices[self.edge_table.ends].swapaxes(0, 1)
         return float(np.linalg.norm(a - b, axis=1).mean())
+
+
+def _carried(bary, corners):
+    normal = np.einsum("qi,qij->qj", bary, corners)
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)

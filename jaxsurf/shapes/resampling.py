@@ -40,8 +40,9 @@ def sample_mesh(
         mesh: the surface, closed or with borders.
         n: number of points.
         spacing: distance h between neighbours, instead of n: $n = \text{area} / h^2$.
-        smooth: fit polynomials; if False, the points stay on the triangles with normals
-            carried over from the vertices: right for surfaces with sharp edges.
+        smooth: fit polynomials; if False, the points stay on the triangles, with normals carried
+            over from their corners, where those beyond edges that turn by more than 40 degrees do
+            not count: right for surfaces with sharp edges.
         degree: of the polynomials.
         seed: of the random candidates.
 
@@ -90,7 +91,9 @@ def sample_mesh(
         fixed=project(border, exact=True) if len(border) else None,
         seed=seed,
     )
-    points, normals = project(points, exact=True)
+    points, triangle, bary = closest(points)
+    at = mesh.normals_at if smooth else mesh.creased_normals_at
+    normals = at(triangle, bary)
     if smooth:
         points, normals, used = fit_surface(points, normals, mesh, degree)
         low = np.flatnonzero(used < degree)

@@ -20,6 +20,8 @@ from jaxsurf.shapes.meshes import TriangleMesh
 _MOST_TURN = 0.82
 # Of the normal equations of a fit: the vertices determine it where their condition is below.
 _WORST = 1e4
+# Vertices looked at in turn, in units of the usual number: around a pole many are on a few rings.
+_WIDER = (1, 4, 12)
 # Longest edges are made at most so many times as short beside the shortest.
 _LONGEST = 16.0
 
@@ -33,9 +35,9 @@ def fit_surface(
     fitted by a height polynomial over the tangent plane, with weights that decay from the
     point; its value at the point is the new position, its slope the new normal. Twice, the
     second time over the improved plane. Near is what few edges lead to: where a mesh is long in one
-    direction, as many vertices count in the other. Where the vertices do not determine a polynomial
-    of this degree, or it turns the normal by more than 35 degrees, a lower degree is taken, down
-    to two: a plane is no better than the triangles.
+    direction, as many vertices count in the other. Where they do not determine a polynomial of
+    this degree, or it turns the normal by more than 35 degrees, more of them are taken, then a
+    lower degree, down to two: a plane is no better than the triangles.
 
     Args:
         points: places near the surface, `(q, 3)`.
@@ -51,24 +53,26 @@ def fit_surface(
     stretch = _stretch(mesh)[tree.query(points)[1]]
     used = np.zeros(len(points), np.int64)
     order = np.argsort(_length(stretch), kind="stable")
-    for block in np.array_split(order, max(1, len(points) // 2048)):
-        todo, p = block, degree
-        while todo.size and p >= min(degree, 2):
+    tries = [(degree, wider) for wider in _WIDER] + [(p, 1) for p in range(degree - 1, 1, -1)]
+    for todo in np.array_split(order, max(1, len(points) // 2048)):
+        for p, wider in tries:
+            if not todo.size:
+                break
             x, m, good = points[todo], normals[todo], np.ones(len(todo), bool)
             for _ in range(2):
-                x, m, solved = _fit_once(x, m, stretch[todo], tree, mesh, p)
+                x, m, solved = _fit_once(x, m, stretch[todo], tree, mesh, p, wider)
                 good &= solved
             # Extrapolated over noisy borders, high degrees turn the normal at will; no mesh
             # that resolves its surface has normals this far from those of its triangles.
             good &= np.sum(m * normals[todo], axis=1) > _MOST_TURN
             points[todo[good]], normals[todo[good]], used[todo[good]] = x[good], m[good], p
-            todo, p = todo[~good], p - 1
+            todo = todo[~good]
     return points, normals, used
 
 
-def _fit_once(points, normals, stretch, tree, mesh, degree):
+def _fit_once(points, normals, stretch, tree, mesh, degree, wider):
     size = polynomial_count(2, degree)
-    k = min(2 * size + 4, tree.n)
+    k = min(wider * (2 * size + 4), tree.n)
     slots, squared = _nearest(points, stretch, tree, mesh, k)
     radius, normals = np.sqrt(squared.max(axis=0)), normals.T
     offsets = np.stack([v[slots] - x for v, x in zip(mesh.vertices.T, points.T)], axis=1)

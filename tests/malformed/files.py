@@ -97,6 +97,12 @@ READ = [
     ),
     Case(
         "read",
+        "normals as text",
+        lambda: js.read(text("b.obj", MESH), normals="no"),
+        ("normals", "'no'", "bool"),
+    ),
+    Case(
+        "read",
         "negative seed",
         lambda: js.read(text("b.obj", MESH), n=20, seed=-1),
         ("seed = -1", "at least 0"),

@@ -132,8 +132,10 @@ def read(
             return sample_mesh(mesh, n=n, spacing=spacing, smooth=smooth, degree=degree, seed=seed)
         if own is None:
             own = fitted_normals(path, mesh, degree) if smooth else mesh.vertex_normals
-        elif smooth:
-            compare_normals(path, mesh, own, degree)
+        else:
+            own = unit_normals(own)
+            if smooth:
+                compare_normals(path, mesh, own, degree)
         boundary = None if mesh.closed else jnp.asarray(mesh.border_vertices)
         return PointCloud(jnp.asarray(mesh.vertices), jnp.asarray(own), boundary=boundary)
     except ValueError as error:

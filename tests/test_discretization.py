@@ -201,10 +201,10 @@ def test_integrals_on_points_at_random():
 
 @pytest.mark.parametrize(
     ("scan", "n", "most"),
-    [(data.bunny, 3_000, 20), (data.spot, 3_000, 2), (data.armadillo, 10_000, 86)],
+    [(data.bunny, 3_000, 24), (data.spot, 3_000, 3), (data.armadillo, 10_000, 80)],
 )
 def test_few_cells_of_scans_are_not_closed(scan, n, most):
-    """Those at folds: 18, 1 and 78 of them; one or a tenth more where rounding is another.
+    """Those at folds: 22, 2 and 73 of them; one or a tenth more where rounding is another.
 
     Integrals are refused where there are some, and only there.
     """

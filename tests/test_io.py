@@ -168,9 +168,40 @@ def test_normals_of_a_file_beside_the_triangles(tmp_path):
         read(plain, smooth=False)
     turned = written("turned.obj", mesh.vertices, mesh.triangles[:, ::-1])
     for sizes in ({}, {"n": 300}):
-        with pytest.warns(UserWarning, match="400 of 400 normals point to the other side"):
+        with pytest.warns(UserWarning, match="796 of 796 triangles normals point to the other"):
             cloud = read(turned, **sizes)
         assert float(jnp.sum(cloud.points * cloud.normals, axis=1).min()) > 0.9
+    # Which nobody asks for where points are others.
+    none = written("none.obj", 0 * weighted, mesh.triangles)
+    assert read(none, n=300).n == 300
+    with pytest.raises(ValueError, match=r"expected a direction .*normals=False"):
+        read(none)
+
+
+def test_every_piece_has_the_side_of_its_normals(tmp_path):
+    one, other = ball_mesh(400), ball_mesh(200)
+    x = np.concatenate([one.vertices, other.vertices + np.array([3, 0, 0])])
+    n = np.concatenate([one.vertices, other.vertices])
+    faces = np.concatenate([one.triangles, 400 + other.triangles[:, ::-1]])
+    lines = [f"vn {a} {b} {c}\n" for a, b, c in n.tolist()]
+    lines += ["f " + " ".join(f"{i + 1}//{i + 1}" for i in t) + "\n" for t in faces.tolist()]
+    path = write_obj(tmp_path / "two.obj", x, [], "".join(lines))
+    with pytest.warns(UserWarning, match="396 of 1192 triangles"):
+        cloud = read(path, n=500)
+    away = cloud.points - jnp.where(cloud.points[:, :1] > 1.5, jnp.array([3.0, 0, 0]), 0)
+    assert float(jnp.sum(away * cloud.normals, axis=1).min()) > 0.9
+
+
+def test_exact_normals_of_a_coarse_mesh_are_no_worse_than_fits(tmp_path):
+    x, t = torus_grid(48, 20)
+    center = x * [1, 1, 0]
+    normals = (x - center / np.linalg.norm(center, axis=1, keepdims=True)) / 0.4
+    lines = [f"vn {a} {b} {c}\n" for a, b, c in normals.tolist()]
+    lines += ["f " + " ".join(f"{i + 1}//{i + 1}" for i in row) + "\n" for row in t.tolist()]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cloud = read(write_obj(tmp_path / "exact.obj", x, [], "".join(lines)))
+    np.testing.assert_allclose(cloud.normals, normals, atol=1e-12)
 
 
 def test_a_list_with_commas_says_what_is_expected(tmp_path):

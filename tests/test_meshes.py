@@ -345,6 +345,25 @@ def test_sharp_edges_stay_with_smooth_off():
         sample_mesh(cube, n=600)
 
 
+def test_a_triangle_without_area_has_the_normals_around():
+    """As where a corner of one face lies on the edge of another: there they were NaN."""
+    cube = cube_mesh()
+    x = np.concatenate([cube.vertices, [[0.5, 0.0, 0.0]]])
+    edge = [np.flatnonzero((x == corner).all(axis=1))[0] for corner in ([0, 0, 0], [1, 0, 0])]
+    triangles = cube.triangles
+    side = next(i for i, t in enumerate(triangles) if set(edge) <= set(t))
+    t = triangles[side]
+    start = next(k for k in range(3) if {t[k], t[(k + 1) % 3]} == set(edge))
+    a, b, c = np.roll(t, -start)
+    split = [[a, 8, c], [8, b, c], [a, b, 8]]
+    mesh = TriangleMesh(x, np.concatenate([np.delete(triangles, side, axis=0), split]))
+    assert mesh.closed and np.isfinite(mesh.corner_normals).all()
+    cloud = sample_mesh(mesh, n=1_000, smooth=False)
+    # All but those on that edge, which may be of the triangle without area.
+    off = np.abs(np.asarray(cloud.points)[:, 1:]).max(axis=1) > 1e-9
+    assert np.abs(np.abs(cloud.normals).max(axis=1) - 1)[off].max() < 1e-12
+
+
 def test_bad_requests():
     mesh = ball_mesh(200)
     with pytest.raises(ValueError, match="give one of n and spacing, not n = None and spacing = N"):

@@ -76,7 +76,8 @@ def optimize_shape(
             preconditioner.
         callback: called with the `ShapeOptimization` so far after each step; True ends it.
         checkpoint: where all is written after every so many steps; if the file is there, the same
-            run, of more `steps` too, goes on from it and ends in the same bits.
+            run, of more `steps` too, goes on from it and ends in the same bits; what a file of more
+            steps than are asked for holds is returned as it is.
         throw: raise where it cannot go on; if False, see `stopped`.
 
     Returns:

@@ -102,7 +102,9 @@ def _corrected(a, s, wanted, w, basis, solve, relative):
 
     missing = lambda s: systems.subtract(wanted, systems.moments(basis, w * s))
     residual = lambda left: relative(jnp.stack(left) if isinstance(left, list) else left)
-    open_ = lambda state: jnp.max(residual(state[2])) > _SINGLE
+    # Fewer points than moments never meet them.
+    able = jnp.sum(w > 0, axis=0) >= len(basis)
+    open_ = lambda state: jnp.any(able & (residual(state[2]) > _SINGLE))
     once = lambda _, state: jax.lax.cond(open_(state), corrected, lambda state: state, state)
     a, s, left = jax.lax.fori_loop(0, _ROUNDS, once, (a, s, missing(s)))
     return a, s, residual(left)

@@ -17,51 +17,59 @@ def unit_normals(normals: np.ndarray, on: np.ndarray | bool = True) -> np.ndarra
     length = np.linalg.norm(normals, axis=1)
     bad = on & ~(np.isfinite(length) & (length > 0))
     length = np.where(on, length, 1)
-    raise_at(bad, "normal {i} is {v}, expected a direction", normals)
+    text = "normal {i} is {v}, expected a direction (normals=False takes none from the file)"
+    raise_at(bad, text, normals)
     return normals / length[:, None]
 
 
 def own_normals(contents: Contents, kept) -> np.ndarray:
-    """Those in the file at the vertices of the mesh; the mean of those that were merged."""
+    """Those in the file at the vertices of the mesh, of any length; of merged ones the sum."""
     assert contents.normals is not None
     first, group = merge_equal(contents.points)
     total = np.zeros((len(first), 3))
     np.add.at(total, group, contents.normals)
-    return unit_normals(total[group[kept]])
+    return total[group[kept]]
 
 
 def turned_to(path, mesh: TriangleMesh, normals: np.ndarray) -> TriangleMesh:
-    """The mesh with the side that normals point to."""
-    others = np.sum(mesh.vertex_normals * normals, axis=1) < 0
-    if 2 * np.count_nonzero(others) <= len(others):
+    """The mesh with each piece turned to the side that most of the normals on it point to."""
+    own = np.nan_to_num(normals)[mesh.triangles].sum(axis=1)
+    votes = np.bincount(mesh.components, np.sign(np.sum(own * mesh.face_normals, axis=1)))
+    turned = (votes < 0)[mesh.components]
+    if not turned.any():
         return mesh
     warn(
-        f"{path}: {np.count_nonzero(others)} of {len(others)} normals point to the other side than "
-        "the order of corners tells: triangles are turned round to theirs"
+        f"{path}: on {turned.sum()} of {len(turned)} triangles normals point to the other side "
+        "than the order of corners tells: these are turned round to them"
     )
-    return TriangleMesh(mesh.vertices, mesh.triangles[:, ::-1])
+    triangles = np.where(turned[:, None], mesh.triangles[:, ::-1], mesh.triangles)
+    return TriangleMesh(mesh.vertices, triangles)
 
 
 # Normals in a file are no better than those of triangles where they are as far from those of a fit
-# to a share of this, if that is more than this angle.
-_SHARE, _ANGLE = 0.3, 3e-4
+# to a share of this, if that is more than this angle; told from so many of them.
+_SHARE, _ANGLE, _SAMPLE = 0.3, 3e-4, 2_000
 
 
 def compare_normals(path, mesh: TriangleMesh, normals: np.ndarray, degree: int) -> None:
     """Warn of normals of first order."""
-    if len(mesh.vertices) < math.comb(degree + 2, 2) + 2:
+    n = len(mesh.vertices)
+    if n < math.comb(degree + 4, 2) + 2:
         return
-    _, fitted, used = fit_surface(mesh.vertices, mesh.vertex_normals, mesh, degree)
+    rows = np.linspace(0, n - 1, min(n, _SAMPLE)).astype(int)
+    place = mesh.vertices[rows], mesh.vertex_normals[rows], mesh
+    _, fitted, used = fit_surface(*place, degree)
     good = used == degree
     if not good.any():
         return
-    off = [np.linalg.norm(some - fitted, axis=1)[good] for some in (normals, mesh.vertex_normals)]
-    own, plain = map(np.median, off)
-    if own > max(_ANGLE, _SHARE * plain):
+    others = normals[rows], mesh.vertex_normals[rows], fit_surface(*place, degree + 2)[1]
+    off = (np.median(np.linalg.norm(other - fitted, axis=1)[good]) for other in others)
+    own, plain, unsure = off
+    if own > max(_ANGLE, _SHARE * plain, unsure):
         warn(
             f"{path}: normals in the file are {own:.2g} rad off those of fits of degree {degree} "
-            f"(median; at most {off[0].max():.2g}), those of the triangles {plain:.2g}. "
-            "normals=False takes those of the fits, smooth=False says that edges are sharp"
+            f"(median), those of the triangles {plain:.2g}. normals=False takes those of the fits, "
+            "smooth=False says that edges are sharp"
         )
 
 

@@ -14,8 +14,8 @@ from scipy.sparse import csgraph
 from jaxsurf.arguments import in_range, on_host, shaped
 from jaxsurf.failures import not_finite, raise_at
 
-# Cosine of the turn between two triangles that makes an edge a sharp one: 40 degrees.
-_CREASE = 0.766
+# Cosine of the turn between two triangles that makes an edge a sharp one, 40 degrees, and of half.
+_CREASE, _HALF_CREASE = 0.766, 0.9397
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class TriangleMesh:
         return np.where(self.areas[:, None] > 0, angle, 0)
 
     @cached_property
-    def _face_normals(self) -> Float[Array, "m 3"]:
+    def face_normals(self) -> Float[Array, "m 3"]:
         """Unit normals of the triangles; 0 without area."""
         area = self.areas[:, None]
         return np.where(area > 0, self._area_vectors / np.where(area > 0, area, 1), 0)
@@ -117,7 +117,7 @@ class TriangleMesh:
         """
         total = np.zeros_like(self.vertices)
         for vertices, angle in zip(self.triangles.T, self._corner_angles.T):
-            np.add.at(total, vertices, angle[:, None] * self._face_normals)
+            np.add.at(total, vertices, angle[:, None] * self.face_normals)
         with np.errstate(invalid="ignore"):
             return total / np.linalg.norm(total, axis=1, keepdims=True)
 
@@ -128,18 +128,22 @@ class TriangleMesh:
         Triangles around whose normals are more than 40 degrees off its own, beyond a sharp edge, do
         not count.
         """
-        corners = np.arange(self.triangles.size)
-        at = sparse.csr_array((np.ones(corners.size), (corners, self.triangles.ravel())))
-        pairs = (at @ at.T).tocoo()
-        one, other = pairs.coords
-        normal = self._face_normals
+        normal, found = self.face_normals, self.vertex_normals[self.triangles]
+        # Two that are both within half of that of the normal at a vertex are within it.
+        sharp = np.zeros(len(self.vertices), bool)
+        sharp[self.triangles[np.einsum("md,mid->mi", normal, found) < _HALF_CREASE]] = True
+        vertex = self.triangles.ravel()
+        corners = np.flatnonzero(sharp[vertex])
+        places = np.arange(corners.size), vertex[corners]
+        at = sparse.csr_array((np.ones(corners.size), places), (corners.size, len(sharp)))
+        one, other = (corners[i] for i in (at @ at.T).tocoo().coords)
         smooth = np.sum(normal[one // 3] * normal[other // 3], axis=1) > _CREASE
         one, other = one[smooth], other[smooth]
         shares = self._corner_angles.ravel()[other, None] * normal[other // 3]
-        total = np.stack([np.bincount(one, column, corners.size) for column in shares.T], axis=1)
-        with np.errstate(invalid="ignore"):
-            total = total / np.linalg.norm(total, axis=1, keepdims=True)
-        return total.reshape(-1, 3, 3)
+        total = np.stack([np.bincount(one, column, vertex.size) for column in shares.T], axis=1)
+        length = np.linalg.norm(total, axis=1, keepdims=True)
+        own = total / np.where(length > 0, length, 1)
+        return np.where(length > 0, own, found.reshape(-1, 3)).reshape(-1, 3, 3)
 
     @cached_property
     def border_edges(self) -> Int[Array, "b 2"]:

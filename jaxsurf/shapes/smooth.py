@@ -54,7 +54,7 @@ def fit_surface(
     used = np.zeros(len(points), np.int64)
     order = np.argsort(_length(stretch), kind="stable")
     tries = [(degree, wider) for wider in _WIDER] + [(p, 1) for p in range(degree - 1, 1, -1)]
-    for todo in np.array_split(order, max(1, len(points) // 2048)):
+    for todo in np.array_split(order, 1 + len(points) // 2048):
         for p, wider in tries:
             if not todo.size:
                 break
@@ -115,12 +115,14 @@ def _stretch(mesh: TriangleMesh) -> Float[Array, "n 3 3"]:
     c = np.einsum("nia,nab,njb->nij", tangents, spread, tangents)
     c = c + c.trace(axis1=1, axis2=2)[:, None, None] / _LONGEST**2 * np.eye(2)
     # Of two by two: c^(1/2) is (c + s) / (tr c + 2 s)^(1/2), with s^2 = det c.
-    s = np.sqrt(np.linalg.det(c))
-    inverse = (c.trace(axis1=1, axis2=2) + s)[:, None, None] * np.eye(2) - c
-    root = inverse / np.sqrt((c.trace(axis1=1, axis2=2) + 2 * s) * s)[:, None, None]
+    trace = c.trace(axis1=1, axis2=2)
+    with np.errstate(invalid="ignore", divide="ignore"):  # at vertices of no triangle
+        s = np.sqrt(np.linalg.det(c))
+        inverse = (trace + s)[:, None, None] * np.eye(2) - c
+        root = inverse / np.sqrt((trace + 2 * s) * s)[:, None, None]
     stretch = np.einsum("nia,nij,njb->nab", tangents, root, tangents)
     stretch = stretch + normal[:, :, None] * normal[:, None]
-    return np.where(np.isfinite(stretch), stretch, np.eye(3))  # at vertices of no triangle
+    return np.where(np.isfinite(stretch), stretch, np.eye(3))
 
 
 def _length(stretch):

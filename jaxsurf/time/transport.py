@@ -59,8 +59,8 @@ class AdvectionDiffusionReaction(AbstractEvolution):
             `(n, 1)`, `(n, c)` in space, or a function of time that returns one of these. In
             space it stands inside the divergence.
         gradient: the surface gradient, needed with a velocity.
-        velocity: tangential (in the conservative form that is checked), `(n, d)`, or a function of
-            time that returns one.
+        velocity: tangential, `(n, d)`, or a function of time that returns one; in the conservative
+            form that is checked, of a function at both ends.
         reaction: `(t, u, args) -> f`, of the shape of u; None for none.
         conservative: the form above; if False $v\cdot\nabla u$ in place of $\nabla\cdot(v\,u)$.
         stabilization: an operator added to the right-hand side, that damps what advection
@@ -166,6 +166,9 @@ class AdvectionDiffusionReaction(AbstractEvolution):
         return _UNDAMPED if undamped else None
 
     def check(self, t):
+        if callable(self.velocity) and self.conservative and self.gradient is not None:
+            v = _checked_velocity(user(self.velocity, "velocity", t), self.gradient)
+            _check_tangential(v, self.gradient)
         if self.laplacian is None:
             return
         if isinstance(self.laplacian, Stencil) and is_concrete(self.laplacian.weights):
@@ -274,7 +277,7 @@ def _check_tangential(velocity, gradient: Stencil) -> None:
     """A divergence sees what is normal in a velocity, which is none of a surface at rest."""
     if not is_concrete(velocity, gradient.weights):
         return
-    weights, velocity = np.asarray(gradient.weights), np.asarray(velocity)
+    weights, velocity = np.nan_to_num(np.asarray(gradient.weights)), np.asarray(velocity)
     # Rows of a gradient are tangential, those of DC-PSE nearly; in a plane nothing is normal.
     sizes, axes = np.linalg.eigh(np.einsum("kin,kjn->nij", weights, weights))
     normal = np.abs(np.einsum("ni,ni->n", velocity, axes[:, :, 0]))

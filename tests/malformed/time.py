@@ -162,7 +162,8 @@ INTEGRATE = [
     case("integrate", "reaction None",
          lambda: integrate(heat(reaction=lambda t, u, a: None)), "reaction", "None"),
     case("integrate", "velocity in NumPy", lambda: quiet(lambda: integrate(
-         moved(velocity=lambda t: np.float64(t) * np.ones((N, 2))))), "velocity", "jax.numpy"),
+         moved(velocity=lambda t: np.float64(t) * np.ones((N, 2)), conservative=False))),
+         "velocity", "jax.numpy"),
     case("integrate", "diffusivity negative in time",
          lambda: integrate(heat(diffusivity=lambda t: 0.5 - t)), "diffusivity", "-0.5", "t = 1"),
     case("integrate", "diffusivity per nothing", lambda: integrate(heat(diffusivity=np.ones(5))),
@@ -216,6 +217,8 @@ SPECIAL = [
         ("velocity NaN", lambda: moved(velocity=np.full((N, 2), nan)), ("velocity", "point 0")),
         ("velocity along normals", lambda: moved(velocity=js.circle(N).normals),
          ("velocity", "point 0", "normal part 1", "0.05")),
+        ("velocity along normals at times", lambda: integrate(moved(
+            velocity=lambda t: jnp.asarray(js.circle(N).normals))), ("velocity", "normal part 1")),
         ("velocity complex", lambda: moved(velocity=1j * np.ones((N, 2))), ("velocity", "complex")),
         ("gradient an array", lambda: moved(gradient=np.ones((N, 2))), ("gradient", "(12, 2)")),
         ("gradient of other points", lambda: heat(gradient=ring(20)[2]), ("gradient", "20", "12")),

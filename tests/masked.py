@@ -157,8 +157,7 @@ def applied(operator, c: Case, u=None):
 
 
 def velocity(c: Case):
-    x, y, z = c.x.T
-    return c.field(np.stack([-y, x, 0 * z], axis=1))
+    return c.field(np.cross(np.asarray(c.cloud.normals)[c.rows], c.x))
 
 
 def tensor(c: Case):

@@ -36,6 +36,11 @@ def as_float(x: Any, name: str = "array", *shapes: tuple) -> Float[Array, "..."]
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
 
 
+def same_values(a: Any, b: Any) -> bool:
+    """Whether two pytrees of one structure hold the same numbers; compiles nothing."""
+    return all(np.array_equal(*pair) for pair in zip(jax.tree.leaves(a), jax.tree.leaves(b)))
+
+
 def on_host(x: Any, name: str = "array", *shapes: tuple) -> np.ndarray:
     """The array in NumPy and double precision, for what is done on the host.
 

@@ -26,7 +26,7 @@ from .failures import (
     without_derivatives,
 )
 from .indices import point_indices
-from .sheets import distance_key, judge, nearest, without_islands
+from .sheets import distance_key, judge, nearest, nearest_on_sheet, without_islands
 
 
 class Neighbors(eqx.Module):
@@ -246,12 +246,7 @@ def nearest_of(
     wanted = np.flatnonzero(on[rows])
     place = (np.cumsum(on) - 1)[rows[wanted]]
     tree = cKDTree(points.astype(float))
-    slots, accepted = nearest(points, normals, tree, k, min_cosine, rows=place)
-    above = two_sheets(points, normals, slots, place)
-    if above.any():
-        slots, accepted = without_islands(
-            points, normals, tree, slots, accepted, above, min_cosine, rows=place
-        )
+    slots, accepted = nearest_on_sheet(points, normals, tree, k, min_cosine, rows=place)
     indices, mask = np.tile(rows[:, None].astype(np.int32), k), np.zeros((len(rows), k), bool)
     indices[wanted], mask[wanted] = names[slots], accepted
     return indices, mask

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.spatial import cKDTree
 
 from .arguments import POINTS, as_float, as_many, in_range, instance, switched_off, whole
-from .checks import check_count, check_spacing, two_sheets
+from .checks import check_count, check_spacing
 from .cloud import PointCloud
 from .compiling import sized_jit
 from .failures import check, is_concrete, needs_values, not_finite, raise_at, warn
@@ -20,7 +20,7 @@ from .indices import mask
 from .machine import FITTED, MOVING, block
 from .neighbors import Neighbors
 from .orient import check_one_sided, orient_normals, plane_normals
-from .sheets import nearest, without_islands
+from .sheets import nearest, nearest_on_sheet
 
 # Below this smallest pivot of the scaled normal equations, times the round-off, a fit is noise.
 _PIVOT = 100
@@ -124,10 +124,9 @@ def estimate_normals(
     guess = plane_normals(x.astype(float), tree)
     if orient:
         guess = orient_normals(x.astype(float), guess, tree)
-    slots, found = nearest(x, guess, tree, k, 0.0 if orient else -1.0)
-    above = two_sheets(x, guess, slots, np.arange(n))
-    if orient and above.any():
-        slots, found = without_islands(x, guess, tree, slots, found, above, 0.0)
+        slots, found = nearest_on_sheet(x, guess, tree, k, 0.0)
+    else:
+        slots, found = nearest(x, guess, tree, k, -1.0)
     count, needs = found.sum(axis=1), f"degree {degree} needs at least {needed}"
     text = f"point {{i}} has {{v}} neighbours on its side of the surface, {needs}"
     raise_at(count < needed, text, count)

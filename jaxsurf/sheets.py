@@ -7,7 +7,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from .checks import DETOUR, LINK, RINGS, query, ring_size
+from .checks import DETOUR, LINK, RINGS, query, ring_size, two_sheets
 
 
 def distance_key(squared: np.ndarray) -> np.ndarray:
@@ -49,6 +49,17 @@ def nearest(points, normals, tree, k: int, min_cosine: float, *, rows=None):
         todo = todo[~done]
         count = min(most, 2 * count)
     return np.where(mask, slots, rows[:, None]), mask
+
+
+def nearest_on_sheet(points, normals, tree, k: int, min_cosine: float, *, rows=None):
+    """`nearest`, without what lies across a gap on another sheet of the same orientation."""
+    slots, mask = nearest(points, normals, tree, k, min_cosine, rows=rows)
+    above = two_sheets(points, normals, slots, np.arange(len(points)) if rows is None else rows)
+    if above.any():
+        slots, mask = without_islands(
+            points, normals, tree, slots, mask, above, min_cosine, rows=rows
+        )
+    return slots, mask
 
 
 def without_islands(

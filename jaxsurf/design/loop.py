@@ -15,6 +15,7 @@ import numpy as np
 import optax
 from jaxtyping import PyTree
 
+from ..arguments import same_values
 from ..time.checkpoint import Checkpoint, digest, read_back, written
 from .asked import ILL, is_only_far, refuse_start
 from .lagrangian import (
@@ -203,7 +204,7 @@ class Loop(NamedTuple):
         else:
             return run, shape, _halved(run, ill)
         rebuilt, renewed, shape = covering is not shape, anew is not covering, anew
-        still, why = _same(run.theta, theta), ""
+        still, why = same_values(run.theta, theta), ""
         run = run._replace(
             step=run.step + 1, theta=theta, state=state, values=values, since=run.since + 1
         )
@@ -232,7 +233,7 @@ class Loop(NamedTuple):
         def beyond(theta):
             """A search along a line goes on to where there are other parts."""
             (_, values, ill), there = look(theta)
-            ills.extend([] if _same(run.theta, there) else [ill])
+            ills.extend([] if same_values(run.theta, there) else [ill])
             return values
 
         updates, state = direction(self.optimizer, beyond, run.theta, run.values, run.state)
@@ -381,8 +382,3 @@ def _note(run: _Run, **others) -> None:
     known |= dict(penalty=run.multipliers.penalty) | others | v.equalities | v.inequalities
     for name, value in known.items():
         run.history[name][row] = np.asarray(value)
-
-
-def _same(a: PyTree, b: PyTree) -> bool:
-    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b))
-    return all(bool(np.array_equal(x, y)) for x, y in pairs)

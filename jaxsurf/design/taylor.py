@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ..arguments import finite, floating, on_host
+from ..arguments import finite, floating, on_host, same_values
 from ..failures import needs_values, not_positive, raise_at
 
 # How many steps there are by default, and what multiple of the rounding of f and x is round-off.
@@ -107,7 +107,7 @@ def taylor_remainders(
     shifted = lambda step: jax.tree.map(
         lambda a, v: a + jnp.asarray(step, a.dtype) * v, x, direction
     )
-    if _same(x, shifted(at.max())):
+    if same_values(x, shifted(at.max())):
         raise ValueError("direction is zero, or so short that x is the same after all steps")
 
     kind = jax.eval_shape(f, x)
@@ -124,7 +124,3 @@ def taylor_remainders(
     remainders = np.abs(values - float(value) - at * derivative)
     rounding = _ROUNDING * epsilon * (abs(float(value)) + size(gradient, x))
     return TaylorRemainders(at, remainders, derivative, float(rounding))
-
-
-def _same(a: PyTree, b: PyTree) -> bool:
-    return all(np.array_equal(*pair) for pair in zip(jax.tree.leaves(a), jax.tree.leaves(b)))

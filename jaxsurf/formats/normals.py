@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from jaxsurf.failures import raise_at, warn
 from jaxsurf.formats.contents import Contents
 from jaxsurf.shapes.cleaning import merge_equal
 from jaxsurf.shapes.meshes import TriangleMesh
-from jaxsurf.shapes.smooth import fit_surface
+from jaxsurf.shapes.smooth import fit_surface, vertices_needed
 
 
 def unit_normals(normals: np.ndarray, on: np.ndarray | bool = True) -> np.ndarray:
@@ -54,7 +52,7 @@ _SHARE, _ANGLE, _SAMPLE = 0.3, 3e-4, 2_000
 def compare_normals(path, mesh: TriangleMesh, normals: np.ndarray, degree: int) -> None:
     """Warn of normals of first order."""
     n = len(mesh.vertices)
-    if n < math.comb(degree + 4, 2) + 2:
+    if n < vertices_needed(degree + 2):
         return
     rows = np.linspace(0, n - 1, min(n, _SAMPLE)).astype(int)
     place = mesh.vertices[rows], mesh.vertex_normals[rows], mesh
@@ -74,7 +72,7 @@ def compare_normals(path, mesh: TriangleMesh, normals: np.ndarray, degree: int) 
 
 
 def fitted_normals(path, mesh: TriangleMesh, degree: int) -> np.ndarray:
-    need = math.comb(degree + 2, 2) + 2
+    need = vertices_needed(degree)
     if len(mesh.vertices) < need:
         raise ValueError(
             f"{len(mesh.vertices)} vertices, normals of degree {degree} need at least"

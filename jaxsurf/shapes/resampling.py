@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +14,7 @@ from jaxsurf.shapes.closest import ClosestPoint
 from jaxsurf.shapes.meshes import TriangleMesh
 from jaxsurf.shapes.order import sort_cloud
 from jaxsurf.shapes.sampling import quasi_uniform
-from jaxsurf.shapes.smooth import fit_surface
+from jaxsurf.shapes.smooth import fit_surface, vertices_needed
 from jaxsurf.shapes.spacing import MOST, ideal_spacing, points_at
 
 
@@ -68,7 +66,7 @@ def sample_mesh(
     whole(seed, "seed", least=0)
     instance(smooth, (bool, np.bool_), "smooth")
     n, h = _how_many(mesh.area, n, spacing)
-    need = math.comb(degree + 2, 2) + 2
+    need = vertices_needed(degree)
     if smooth and len(mesh.vertices) < need:
         raise ValueError(
             f"the mesh has {len(mesh.vertices)} vertices, a smooth fit of degree {degree} needs"

@@ -70,9 +70,14 @@ def fit_surface(
     return points, normals, used
 
 
+def vertices_needed(degree: int) -> int:
+    """The fewest that a fit of this degree is made of."""
+    return polynomial_count(2, degree) + 2
+
+
 def _fit_once(points, normals, stretch, tree, mesh, degree, wider):
-    size = polynomial_count(2, degree)
-    k = min(wider * (2 * size + 4), tree.n)
+    need = vertices_needed(degree)
+    k = min(wider * 2 * need, tree.n)
     slots, squared = _nearest(points, stretch, tree, mesh, k)
     radius, normals = np.sqrt(squared.max(axis=0)), normals.T
     offsets = np.stack([v[slots] - x for v, x in zip(mesh.vertices.T, points.T)], axis=1)
@@ -83,7 +88,7 @@ def _fit_once(points, normals, stretch, tree, mesh, degree, wider):
     plane = replace(plane, points=np.einsum("ijp,jkp->ikp", stretch, plane.points))
     c, condition = plane.surface(0, degree)
     # A fit that lifts a point by more than the distance between vertices is no fit.
-    enough = (same.sum(axis=0) >= size + 2) & (condition < _WORST)
+    enough = (same.sum(axis=0) >= need) & (condition < _WORST)
     enough &= np.abs(c[0]) < 1 / math.sqrt(k)
     c = np.where(enough, c, 0)
     slopes = np.einsum("ijp,jp->ip", stretch, c[1:3])

@@ -234,8 +234,12 @@ def report(result: demo.Demo) -> list[str]:
         ),
         (
             "heat conserved",
-            f"to {result.lost:.1e} (sum over Voronoi cells)"
-            + ("; borders held at their temperature" if border else ""),
+            f"to {result.lost:.1e} (sum over Voronoi cells); "
+            + (
+                "borders held at their temperature"
+                if border
+                else f"without correction to {result.lost_uncorrected:.1e}"
+            ),
         ),
         ("gradient", f"d u(probe, t = {heat.until:g}) / d ({name}) at {value:g}"),
         ("  jax.grad", f"{result.gradient:.10g}"),

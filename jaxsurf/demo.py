@@ -25,7 +25,7 @@ from .conditions import dirichlet
 from .curvature import shape_tensor
 from .failures import warn
 from .formats.by_suffix import contents_of
-from .heat import Heat, cell_areas, diffuse, spot
+from .heat import Heat, carried, cell_areas, diffuse, spot
 from .io import read, write
 from .neighbors import Neighbors
 from .onesided import eliminate
@@ -138,6 +138,7 @@ class Demo:
     curvature: dict[str, Float[Array, " n"]]
     heat: Heat
     temperature: Float[Array, "frames n"]
+    uncorrected: Float[Array, "frames n"]
     areas: Float[Array, " n"]
     source: int
     probe: int
@@ -149,14 +150,14 @@ class Demo:
     seconds: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
-    def content(self) -> Float[np.ndarray, " frames"]:
-        """Heat on the whole surface at each frame."""
-        return np.asarray(self.temperature @ self.areas)
+    def lost(self) -> float:
+        """Relative change of the heat on the whole surface from first to last."""
+        return _change(self.temperature @ self.areas)
 
     @property
-    def lost(self) -> float:
-        """Relative change of the heat from first to last."""
-        return float(abs(self.content[-1] / self.content[0] - 1))
+    def lost_uncorrected(self) -> float:
+        """The same by the operator alone."""
+        return _change(self.uncorrected @ self.areas)
 
     @property
     def disagreement(self) -> float:
@@ -230,7 +231,15 @@ def run(
         # saves.
         value = jnp.asarray(surface.parameter[1], start.dtype)
         at = lambda value: _with_gradient(
-            value, start, surface.moved, neighbors, method, closure, heat, jnp.asarray(probe)
+            value,
+            start,
+            (cloud, surface.moved),
+            areas,
+            neighbors,
+            method,
+            closure,
+            heat,
+            jnp.asarray(probe),
         )
         try:
             (_, temperature), (gradient, sensitivity) = at(value)
@@ -242,6 +251,8 @@ def run(
         step = 1e-4 * value
         above, below = (at(value + h)[0][0] for h in (step, -step))
         difference = (above - below) / (2 * step)
+        # What the correction by the areas hides.
+        uncorrected = temperature if closure else diffuse(laplacian, None, start, heat)
     demo = Demo(
         surface,
         method,
@@ -250,6 +261,7 @@ def run(
         curvature,
         heat,
         temperature,
+        uncorrected,
         areas,
         source,
         probe,
@@ -297,10 +309,13 @@ def save(demo: Demo, out: Path) -> list[Path]:
     return files
 
 
-def _temperature_at(value, start, moved, neighbors, method, closure, heat, probe):
+def _temperature_at(value, start, surface, areas, neighbors, method, closure, heat, probe):
     """Final temperature at the probe for a value of the surface's parameter; and all others."""
-    laplacian = laplace_beltrami(moved(value), neighbors, method=method)
-    temperature = diffuse(laplacian, closure, start, heat)
+    cloud, moved = surface
+    at = moved(value)
+    laplacian = laplace_beltrami(at, neighbors, method=method)
+    kept = carried(areas, cloud, at, neighbors) if closure is None else None
+    temperature = diffuse(laplacian, closure, start, heat, kept)
     return temperature[-1, probe], temperature
 
 
@@ -343,6 +358,10 @@ def _probe(cloud: PointCloud, source: int, distance: float) -> int:
     if cloud.boundary is not None:
         off = np.where(np.asarray(cloud.boundary), np.inf, off)
     return int(np.argmin(np.where(normals @ normals[source] > 0, off, np.inf)))
+
+
+def _change(content: Float[Array, " frames"]) -> float:
+    return float(abs(content[-1] / content[0] - 1))
 
 
 def _rounded(value: float) -> float:

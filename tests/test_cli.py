@@ -14,7 +14,9 @@ import jaxsurf as js
 from jaxsurf import demo
 from jaxsurf.cli import main
 from jaxsurf.formats.by_suffix import contents_of
-from jaxsurf.heat import Heat, cell_areas, diffuse, spot
+from jaxsurf.heat import Heat, carried, cell_areas, diffuse, spot
+
+from .helpers import check_derivative
 
 _DATA = Path("../shared/data")
 
@@ -63,7 +65,8 @@ def test_demo(tmp_path, capsys):
     took = float(re.search(r"\ndone in ([\d.]+) s on \d+ cores", report)[1])
     assert took == pytest.approx(sum(map(float, line(report, "  total").split()[1:])), abs=0.2)
     assert "GFDM(degree=4)" in line(report, "method")
-    assert number(report, "heat conserved", "to") < 5e-3
+    assert number(report, "heat conserved", "to") < 1e-12
+    assert 1e-6 < number(report, "heat conserved", "correction to") < 5e-3
     assert number(report, "  difference", "relative difference") < 1e-6
     # The largest modulus of the fourth-order Laplacian is 4.6 / h² on even points.
     h = number(report, "points", ", ")
@@ -141,6 +144,25 @@ def test_cell_areas(dim):
     # Second moment of a coordinate: a third (a half) of the measure.
     moment = float(areas @ cloud.points[:, -1] ** 2) / measure
     assert abs(moment - 1 / dim) < 1e-3
+
+
+@pytest.mark.parametrize("dim, n, off", [(2, 200, 1e-3), (3, 1_000, 1e-2), (3, 4_000, 5e-3)])
+def test_areas_that_a_motion_carries_along(dim, n, off):
+    """As a linear map stretches the tangent planes, on average."""
+    cloud = js.sphere(n) if dim == 3 else js.circle(n)
+    neighbors = js.find_neighbors(cloud, k=20 if dim == 3 else 7)
+    areas, axes = cell_areas(cloud, neighbors), jnp.array([1.0, 0.7, 1.3])[:dim]
+
+    def carried_to(axes):
+        normals = cloud.normals / axes
+        normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+        return carried(areas, cloud, js.PointCloud(cloud.points * axes, normals), neighbors)
+
+    np.testing.assert_allclose(carried_to(jnp.ones(dim)), areas, rtol=1e-14)
+    stretch = jnp.prod(axes) * jnp.linalg.norm(cloud.normals / axes, axis=1)
+    error = carried_to(axes) / (areas * stretch) - 1
+    assert float(jnp.sqrt(jnp.mean(error**2))) < off
+    check_derivative(lambda axes: jnp.sum(carried_to(axes) ** 2), axes, rtol=1e-7)
 
 
 def test_meshes_of_few_triangles_are_taken_as_they_are(tmp_path, capsys):

@@ -49,12 +49,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             None if points == "all" else points,
             smooth=not options.flat,
             largest_part=options.largest_part,
+            border=options.border,
         )
 
     of_files = {
         "--points all": options.points == "all",
         "--flat": options.flat,
         "--largest-part": options.largest_part,
+        "--border": options.border,
     }
     for option, given in of_files.items():
         if given and options.surface is None:
@@ -108,6 +110,12 @@ def _parser() -> argparse.ArgumentParser:
         "--largest-part",
         action="store_true",
         help="leave out triangles until no edge has more than two (largest_part=True of js.read)",
+    )
+    one.add_argument(
+        "--border",
+        action="store_true",
+        help="hold the points that look like border points (js.detect_boundary); of point clouds, "
+        "as meshes tell theirs",
     )
     one.add_argument(
         "--out",

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
+from .borders.detect import detect_boundary
 from .boundary import Closure
 from .cloud import PointCloud
 from .conditions import dirichlet
@@ -89,14 +90,29 @@ def surface_from_file(
     *,
     smooth: bool = True,
     largest_part: bool = False,
+    border: bool = False,
 ) -> Surface:
     """A mesh resampled to n points, or a file's own points (n None, or no triangles in it).
 
-    The rest is for `read`, which states in warnings what it converts. The size of the whole varies.
+    The size of the whole varies.
+
+    Args:
+        smooth, largest_part: for `read`, which states in warnings what it converts.
+        border: for points without triangles: those that `detect_boundary` names are the border.
+
+    Raises:
+        ValueError: a border asked for of triangles, which tell theirs, or where there is none.
     """
     has_triangles = bool(contents_of(path).faces)
     n = n if has_triangles else None
     cloud = read(path, n=n, smooth=smooth, largest_part=largest_part)
+    if border:
+        if has_triangles:
+            raise ValueError(f"{path}: triangles tell where the border is, leave `border` out")
+        found = detect_boundary(cloud)
+        if not found.any():
+            raise ValueError(f"{path}: no point looks like a border point, leave `border` out")
+        cloud = PointCloud(cloud.points, cloud.normals, boundary=found)
     own = "its own points" if n is None else "resampled evenly"
     moved = jax.tree_util.Partial(_scaled, cloud)
     # Scans are usually stored with y up.

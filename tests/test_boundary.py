@@ -716,6 +716,27 @@ def test_borders_are_detected(make):
     assert not js.detect_boundary(js.sphere(700)).any()
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_random_points_inside_are_not_taken_for_borders(seed):
+    """The empty angle alone named 230 of them."""
+    m, n = 63, 4_000
+    inside = np.random.default_rng(seed).uniform(size=(n, 2))
+    s, zero = np.arange(m) / m, np.zeros(m)
+    sides = ((s, zero), (zero + 1, s), (1 - s, zero + 1), (zero, 1 - s))
+    p = np.concatenate([*(np.stack(side, axis=1) for side in sides), inside])
+    x, y = p.T
+    points = np.stack([x, y, 0.2 * np.sin(3 * x) * np.cos(2 * y)], axis=1)
+    slope = 0.6 * np.cos(3 * x) * np.cos(2 * y), -0.4 * np.sin(3 * x) * np.sin(2 * y)
+    normals = np.stack([-slope[0], -slope[1], np.ones_like(x)], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    found = np.asarray(js.detect_boundary(js.PointCloud(points, normals)))
+    assert found[: 4 * m].all()
+    far = np.minimum(p, 1 - p).min(axis=1) > 1.5 / np.sqrt(n)
+    assert np.sum(found & far) < 50
+    torus = js.torus(2_000, R=2.0, r=0.8)
+    assert not js.detect_boundary(torus).any()
+
+
 @pytest.mark.core
 @pytest.mark.parametrize("degrees", [35, 50, 58])
 def test_the_tip_of_a_sharp_corner_lies_on_the_border(degrees):

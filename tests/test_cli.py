@@ -112,10 +112,17 @@ def test_surface_from_file(tmp_path):
     assert own.cloud.n == 1_600 and even.cloud.n == 900
     np.testing.assert_allclose(own.moved(2.0).points, 2 * own.cloud.points)
     assert int(own.cloud.boundary.sum()) == 4 * 39
-    # A list of points has nothing to resample.
+    # A list of points has nothing to resample, and does not tell where its border is.
     cloud = js.sphere(300)
     js.write(tmp_path / "points.xyz", cloud)
     assert demo.surface_from_file(tmp_path / "points.xyz", 100).cloud.n == 300
+    with pytest.raises(ValueError, match="no point looks like a border point"):
+        demo.surface_from_file(tmp_path / "points.xyz", border=True)
+    with pytest.raises(ValueError, match="triangles tell where the border is"):
+        demo.surface_from_file(path, border=True)
+    js.write(tmp_path / "sheet.xyz", js.PointCloud(own.cloud.points, own.cloud.normals))
+    sheet = demo.surface_from_file(tmp_path / "sheet.xyz", border=True).cloud
+    np.testing.assert_array_equal(sheet.boundary, own.cloud.boundary)
 
 
 def test_heat_takes_shorter_steps_for_eigenvalues_beside_the_real_axis():
@@ -233,7 +240,7 @@ def test_bad_input_is_one_line(arguments, words, tmp_path, monkeypatch, capsys):
     "arguments",
     [[], ["dance"], ["demo", "--points", "many"], ["demo", "--points", "-5"],
      ["demo", "--method", "fem"], ["demo", "--points", "all"], ["demo", "--flat"],
-     ["demo", "--largest-part"]],
+     ["demo", "--largest-part"], ["demo", "--border"]],
 )  # fmt: skip
 def test_bad_arguments(arguments, capsys):
     with pytest.raises(SystemExit) as stop:

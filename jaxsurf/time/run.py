@@ -221,7 +221,7 @@ def planned(
         )  # fmt: skip
         event = _ending(event, arrays, now, told)
     saveat = _saving(saveat, arrays, now)
-    limit = _limit(*constant((u0, jnp.asarray(problem._grows, t0.dtype))), t0, t1)
+    limit = _limit(*constant((u0, jnp.asarray(problem._grows, t0.dtype), t0, t1)))
     parts = (terms, solver, t0, t1, dt0, u0, args, controller, limit, saveat, event, adjoint)
     concrete = is_concrete(parts)  # also not inside a `jit`, which would make the limit traced
     _log.info("%s over [%s, %s] by %s", type(problem).__name__, t0, t1, why)

@@ -69,6 +69,22 @@ def test_a_sphere_shrinks_by_its_curvature():
     assert float(turned.min()) > 1 - 1e-6
 
 
+@pytest.mark.parametrize("size, place", [(1.0, 0.0), (1.0, 1e3), (1e-6, 0.0), (1e6, -1e2)])
+def test_neither_place_nor_unit_of_length_makes_steps_coarse(size, place):
+    """A circle shrinks as r² = 1 - t, in units of its radius; tolerances are of those too."""
+    circle = js.circle(60)
+    cloud = js.PointCloud(size * (circle.points + place), circle.normals)
+    end = js.evolve(js.MeanCurvatureFlow(), cloud, t1=0.5 * size**2).clouds[-1]
+    radius = jnp.linalg.norm(end.points / size - place, axis=1)
+    np.testing.assert_allclose(radius, 0.5**0.5, rtol=1e-3)
+
+
+def test_fields_below_the_tolerance_are_told():
+    """Beside points that are not."""
+    with pytest.warns(UserWarning, match=r"fields is at most .* errors of atol = 1e-07"):
+        grown(u=1e-9 * X, t1=0.1)
+
+
 @pytest.mark.slow
 def test_an_ellipsoid_that_keeps_its_volume_loses_area():
     surface = js.discretize(js.ellipsoid(200, (1.2, 1.0, 0.85)), method=js.GFDM(degree=2))

@@ -21,7 +21,7 @@ from ..kept import Kept
 from ..motion import CODES
 from ..stencils.method import AbstractMethod
 from ..stencils.usual import USUAL
-from ..time.asked import check_coefficients
+from ..time.asked import check_coefficients, tell_small
 from ..time.checkpoint import Checkpoint
 from ..time.higher import WaveEquation
 from ..time.integrate import integrate
@@ -151,7 +151,8 @@ def evolve(
         method: of the operators; `GFDM(degree=4)` if None, or that of a surface given.
         saveat: times to save; t1 is always saved.
         solver, dt0, rtol, atol: as for `integrate`; the solver that suits motion and problem if
-            None.
+            None. Of positions the tolerances are relative to the surface: as if its middle were the
+            origin, and the root mean square of the distances from there the unit of length.
         args: handed to velocity, reactions and forcings: what is differentiated goes in here, or
             in `cloud` and `fields`.
         adapt: add points in holes and merge those that crowd, at the start and on the way. What
@@ -223,6 +224,8 @@ def evolve(
             )
         _check_problem(checked_problem(problem(surface)), fields, surface.n)
         check_coefficients(problem(surface), t0, t1)
+        if dt0 is None:
+            tell_small(fields, atol, "fields")
     if concrete:
         motion.check(t0, surface, fields, args)
     options = dict(solver=solver, dt0=dt0, rtol=rtol, atol=atol, args=args)

@@ -198,9 +198,9 @@ def planned(
     if controller is None and dt0 is None:
         within_round_off(rtol, t0.dtype)
         real(atol, "atol", least=0)
-        tell_small(u0, atol)
-        shortest = _shortest(t0, t1)
-        controller = dfx.PIDController(rtol, atol, dtmin=shortest, force_dtmin=False)
+        if type(problem).controller is AbstractEvolution.controller:  # of errors as they are
+            tell_small(u0, atol)
+        controller = problem.controller(rtol, atol, _shortest(t0, t1))
     elif controller is None:
         controller = dfx.ConstantStepSize()
     check_tolerances(controller, t0.dtype)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ..arguments import as_float, as_many, finite, instance, real, switched_off
+from ..arguments import as_float, as_many, finite, instance, is_array, real, switched_off
 from ..cloud import PointCloud
 from ..discretization import Discretization, discretize
 from ..failures import is_concrete, raise_at, refuse
@@ -126,6 +126,7 @@ def evolve(
     rtol: float = 1e-5,
     atol: float = 1e-7,
     args: Any = None,
+    adjoint: dfx.AbstractAdjoint | None = None,
     adapt: Adaptation | None = None,
     contact: Contact | None = None,
     checkpoint: Checkpoint | None = None,
@@ -149,12 +150,13 @@ def evolve(
             conserves is diluted as the surface grows; of a `WaveEquation` that is
             $\partial_t u$. If None, fields go with the points unchanged.
         method: of the operators; `GFDM(degree=4)` if None, or that of a surface given.
-        saveat: times to save; t1 is always saved.
+        saveat: times to save; t1 is always saved (beside traced times once more).
         solver, dt0, rtol, atol: as for `integrate`; the solver that suits motion and problem if
             None. Of positions the tolerances are relative to the surface: as if its middle were the
             origin, and the root mean square of the distances from there the unit of length.
         args: handed to velocity, reactions and forcings: what is differentiated goes in here, or
             in `cloud` and `fields`.
+        adjoint: how to differentiate, as for `integrate`.
         adapt: add points in holes and merge those that crowd, at the start and on the way. What
             the problem, the velocity or a spacing takes must then not have one row per point, but
             be computed from the surface; the support of operators follows from the neighbours.
@@ -171,12 +173,12 @@ def evolve(
 
     Accuracy: in time that of the solver; in space that of the method; in float32 points are within
         1e-5 (`tests/test_moving.py`).
-    Differentiable: forward and reverse, under `jit`, with the neighbours that there were at t0,
-        which must then serve until t1. For longer, in parts: from `surface.moved(points, normals,
-        search=search)`, with neighbours found anew. What the host decides, by `adapt` and
-        `contact`, has no derivative; across points that were added it is that of a surface whose
-        new points are carried by those around them, `surface.interpolate`
-        (`tests/test_moving_gradients.py`). It is not defined across a cut.
+    Differentiable: reverse (forward with `adjoint=diffrax.ForwardMode()`), under `jit`, with the
+        neighbours that there were at t0, which must then serve until t1. For longer, in parts: from
+        `surface.moved(points, normals, search=search)`, with neighbours found anew. What the host
+        decides, by `adapt` and `contact`, has no derivative; across points that were added it is
+        that of a surface whose new points are carried by those around them,
+        `surface.interpolate` (`tests/test_moving_gradients.py`). It is not defined across a cut.
     Raises:
         TypeError: arguments of other kinds.
         ValueError: wrong shapes; times that are not in order; on concrete arrays a surface that
@@ -205,7 +207,7 @@ def evolve(
     field = lambda u: finite(switched_off(on, as_float(u, "fields", (n, ...))), "fields")
     fields = jax.tree.map(field, fields)
     _check_types(fields, surface.cloud.points)
-    concrete = is_concrete(surface, fields, args, t0, t1, motion)
+    concrete = is_concrete(surface, fields, args, t0, t1, saveat, motion)
     if motion.derivatives and concrete:
         _check_closed(motion, surface)
     looked: dict[str, Any] = {"adapt": adapt, "contact": contact, "checkpoint": checkpoint}
@@ -228,7 +230,7 @@ def evolve(
             tell_small(fields, atol, "fields")
     if concrete:
         motion.check(t0, surface, fields, args)
-    options = dict(solver=solver, dt0=dt0, rtol=rtol, atol=atol, args=args)
+    options = dict(solver=solver, dt0=dt0, rtol=rtol, atol=atol, args=args, adjoint=adjoint)
     moving, state = Moving.of(surface, motion, problem), joined(surface.cloud.points, fields)
     if checkpoint is not None:
         instance(checkpoint, Checkpoint, "checkpoint", "js.Checkpoint(path, every=...)")
@@ -273,9 +275,16 @@ def _check_problem(made: AbstractEvolution, fields, n: int) -> None:
         as_many("problem makes operators", made.n, "the surface", n)
     if not jax.tree.leaves(fields):
         raise ValueError("problem is given, but no fields: fields = () has 0 arrays, at least 1")
-    if isinstance(made, WaveEquation) and not (isinstance(fields, tuple) and len(fields) == 2):
-        kind = type(fields).__name__
-        raise ValueError(f"fields is a {kind}, a wave needs 2 arrays: values and velocities")
+    kind = type(fields).__name__
+    if isinstance(made, WaveEquation):
+        if not (isinstance(fields, tuple) and len(fields) == 2):
+            raise ValueError(f"fields is a {kind}, a wave needs 2 arrays: values and velocities")
+    elif made.n is not None and not is_array(fields):
+        count = len(jax.tree.leaves(fields))
+        raise ValueError(
+            f"fields is a {kind} of {count}, {type(made).__name__} has 1 array, (n,) or (n, c): "
+            "several species are its columns"
+        )
 
 
 def _discretized(motion, cloud, method) -> Discretization:
@@ -307,6 +316,8 @@ def _times(t0, t1, saveat) -> list:
         real(value, name)
     if isinstance(saveat, str) or not (saveat is None or np.iterable(saveat)):
         raise TypeError(f"saveat is a {type(saveat).__name__}, expected a sequence of times")
+    if is_array(saveat) and is_concrete(saveat):
+        saveat = np.asarray(saveat)  # whose entries are numbers, also in compiled code
     saved = [] if saveat is None else list(saveat)
     for value in saved:
         real(value, "saveat")

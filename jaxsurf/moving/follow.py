@@ -160,7 +160,7 @@ def _ends(start, end, every: float) -> np.ndarray:
 
 def _digest(moving: Moving, state, start, times, options, kinds, checkpoint: Checkpoint) -> str:
     """Of all that a run hangs on; functions by what they compute."""
-    unset = dict.fromkeys(("controller", "saveat", "event", "adjoint", "max_steps"))
+    unset = dict.fromkeys(("controller", "saveat", "event", "max_steps"))
     plan = planned(moving, state, start, times[-1], **options, **unset, progress=False, throw=True)
     adapt = kinds[0]
     if adapt is not None and callable(adapt.spacing):

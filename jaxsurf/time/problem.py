@@ -34,8 +34,8 @@ class AbstractEvolution(eqx.Module):
     A problem of one's own defines `linear` and `rest` and, unless its state is a single field,
     how to fill in conditions (`closed`). It may say which solver suits it (`suggested_solver`),
     what tolerances are relative to (`controller`) and what multigrid is to invert for it
-    (`factors`). Where geometry is part of the state, `at` makes
-    of it what `linear` and `rest` then use.
+    (`factors`). Where geometry is part of the state, `at` makes of it what `linear` and `rest`
+    then use.
 
     Example:
         >>> class Decay(js.AbstractEvolution):

@@ -108,6 +108,8 @@ CALLS = [
     ("evolve", "a problem without fields", lambda: evolve(problem=heat), ("problem", "0 arrays", "at least 1")),
     ("evolve", "a problem of others", lambda: evolve(fields=jnp.ones(N), problem=lambda s: heat(js.discretize(js.sphere(70), method=js.GFDM(degree=2)))), ("problem", "70", "60")),
     ("evolve", "a wave of one field", lambda: evolve(fields=jnp.ones(N), problem=lambda s: js.WaveEquation(s.laplacian)), ("fields", "2 arrays")),
+    ("evolve", "two species as a pair", lambda: evolve(fields=(jnp.ones(N), jnp.ones(N)), problem=heat), ("fields is a tuple of 2", "AdvectionDiffusionReaction", "(n, c)", "columns")),
+    ("evolve", "an adjoint as text", lambda: evolve(adjoint="forward"), ("adjoint", "forward", "ForwardMode")),
     ("evolve", "a velocity in NumPy", lambda: evolve(js.Motion(lambda t, s, f, a: np.sin(np.asarray(s.cloud.points)))), ("velocity", "jax.numpy")),
     ("adapt_points", "a spacing as large as the surface", lambda: js.adapt_points(surface(), js.Adaptation(3.0)), ("spacing", "are left", "too large", "polynomial")),
     ("Adaptation", "one for true", lambda: js.Adaptation(0.1, conserve=1), ("conserve is 1", "True or False")),

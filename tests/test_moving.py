@@ -72,11 +72,21 @@ def test_a_sphere_shrinks_by_its_curvature():
 @pytest.mark.parametrize("size, place", [(1.0, 0.0), (1.0, 1e3), (1e-6, 0.0), (1e6, -1e2)])
 def test_neither_place_nor_unit_of_length_makes_steps_coarse(size, place):
     """A circle shrinks as r² = 1 - t, in units of its radius; tolerances are of those too."""
+    assert shrunk(size, place, float) < 1e-3
+
+
+def test_round_off_far_from_the_origin_shortens_no_steps():
+    """Single precision has 1e-5 radii left there, as large as the tolerance."""
+    assert shrunk(1.0, 100.0, np.float32) < 3e-3
+
+
+def shrunk(size, place, dtype):
     circle = js.circle(60)
-    cloud = js.PointCloud(size * (circle.points + place), circle.normals)
+    points = (size * (circle.points + place)).astype(dtype)
+    cloud = js.PointCloud(points, circle.normals.astype(dtype))
     end = js.evolve(js.MeanCurvatureFlow(), cloud, t1=0.5 * size**2).clouds[-1]
     radius = jnp.linalg.norm(end.points / size - place, axis=1)
-    np.testing.assert_allclose(radius, 0.5**0.5, rtol=1e-3)
+    return float(jnp.abs(radius / 0.5**0.5 - 1).max())
 
 
 def test_fields_below_the_tolerance_are_told():
@@ -130,6 +140,13 @@ def test_steps_that_go_farther_than_the_neighbours_serve_are_shortened():
     normals = jnp.stack([X, Y, Z - X], axis=1)
     normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
     assert float(jnp.min(jnp.sum(normals * found.clouds[-1].normals, axis=1))) > 0.95
+
+
+def test_an_error_of_a_surface_says_when():
+    """A circle that is pressed flat, where a fold is seen when it is saved."""
+    flat = js.Motion(lambda t, surface, *_: surface.cloud.points * jnp.array([0.0, -3.0]))
+    with pytest.raises(ValueError, match=r"at t = 2: point \d+: .* a fold"):
+        js.evolve(flat, js.circle(60), t1=2.0)
 
 
 @pytest.mark.slow

@@ -10,6 +10,10 @@ from jaxtyping import Array, Bool, Float
 
 from ..arguments import count_on, switched_off
 
+# Errors of positions count as far as they exceed so many times their round-off, which grows with
+# the distance from the origin: no shorter step makes that less.
+_ROUND_OFF = 4
+
 
 class RelativeToSurface(dfx.PIDController):
     r"""Steps of a state of points and fields, by errors of the points in units of the surface.
@@ -34,7 +38,9 @@ class RelativeToSurface(dfx.PIDController):
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state):
         units = _Units.of(y0[0], self.active)
-        before, after, error = units.counted(y0), units.counted(y1_candidate), units.rate(y_error)
+        lost = _ROUND_OFF * jnp.finfo(y0[0].dtype).eps * jnp.abs(y0[0])
+        more = (jnp.maximum(jnp.abs(y_error[0]) - lost, 0), *y_error[1:])
+        before, after, error = units.counted(y0), units.counted(y1_candidate), units.rate(more)
         return super().adapt_step_size(t0, t1, before, after, args, error, error_order, state)
 
 
@@ -63,5 +69,5 @@ class _Units(NamedTuple):
         return (self.middle + self.size * y[0], *y[1:])
 
     def rate(self, change: tuple) -> tuple[Any, ...]:
-        """Of what is counted; and its error, which a middle leaves alone too."""
+        """Of what is counted; so are errors, which a middle leaves alone too."""
         return (change[0] / self.size, *change[1:])

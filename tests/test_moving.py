@@ -379,6 +379,16 @@ def test_a_second_run_compiles_nothing():
     assert again.stats["steps"] == 2
 
 
+def test_the_volume_is_told_of_closed_surfaces_wherever_they_are():
+    still = js.Motion(lambda t, surface, *_: 0 * surface.cloud.points)
+    told = lambda cloud: js.evolve(still, cloud, t1=1.0).history["volume"][-1]
+    far = js.discretize(js.PointCloud(CLOUD.points + 1e4, CLOUD.normals), method=SURFACE.method)
+    np.testing.assert_allclose(told(far), js.volume(SURFACE), rtol=1e-8)
+    angles = jnp.linspace(0, jnp.pi, 40)
+    arc = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
+    assert np.isnan(told(js.PointCloud(arc, arc, boundary=np.arange(40) % 39 == 0)))
+
+
 def test_progress_bar(capfd):
     """In units of t, in few digits: 0.1 + 0.2 is 0.30000000000000004."""
     drift = js.Motion(lambda t, surface, fields, args: 0 * surface.cloud.normals)

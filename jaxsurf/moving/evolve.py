@@ -15,8 +15,9 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ..arguments import as_float, as_many, finite, instance, is_array, real, switched_off
 from ..cloud import PointCloud
+from ..design.functionals import volume
 from ..discretization import Discretization, discretize
-from ..failures import is_concrete, raise_at, refuse
+from ..failures import is_concrete, needs_values, raise_at, refuse, without_derivatives
 from ..kept import Kept
 from ..motion import CODES
 from ..stencils.method import AbstractMethod
@@ -89,7 +90,7 @@ class Evolution(eqx.Module):
     def history(self) -> dict[str, Any]:
         r"""Number of points, area, enclosed volume and integrals of the fields at each time.
 
-        The volume is $\\tfrac1d\\int x\\cdot n$, of closed surfaces. With adaptation also `events`.
+        The volume is `js.volume` of closed surfaces, NaN of others. With adaptation also `events`.
         Raises what `areas` does.
         """
         rows = [_measured(*row) for row in self.rows]
@@ -279,6 +280,9 @@ def _check_problem(made: AbstractEvolution, fields, n: int) -> None:
     if isinstance(made, WaveEquation):
         if not (isinstance(fields, tuple) and len(fields) == 2):
             raise ValueError(f"fields is a {kind}, a wave needs 2 arrays: values and velocities")
+        value, rate = map(jnp.shape, fields)
+        if value != rate:
+            raise ValueError(f"fields of a wave have shapes {value} and {rate}, expected one shape")
     elif made.n is not None and not is_array(fields):
         count = len(jax.tree.leaves(fields))
         raise ValueError(
@@ -293,6 +297,8 @@ def _discretized(motion, cloud, method) -> Discretization:
             raise ValueError(f"method = {method!r}, but the surface given has {cloud.method!r}")
         return cloud
     instance(cloud, PointCloud, "cloud", "js.PointCloud(points, normals), or js.discretize(cloud)")
+    known = without_derivatives(cloud)
+    needs_values("cloud", known, instead="under jit and vmap pass js.discretize(cloud, neighbors)")
     return discretize(cloud, method=USUAL if method is None else method)
 
 
@@ -326,7 +332,7 @@ def _times(t0, t1, saveat) -> list:
     values = np.asarray([float(t0), *map(float, saved), float(t1)])
     if not values[-1] > values[0]:
         raise ValueError(f"t1 = {values[-1]:g}, expected above t0 = {values[0]:g}")
-    text = "saveat turns back after {v} (entry {i}), or leaves the run from t0 to t1"
+    text = "saveat does not rise after {v} (entry {i}), or leaves the run from t0 to t1"
     raise_at(np.diff(values)[1:-1] <= 0, text, values[1:-2])
     raise_at(
         (values[1:-1] < values[0]) | (values[1:-1] > values[-1]),
@@ -362,10 +368,10 @@ def _kept(moving: Moving, state, t, times, options) -> Evolution:
 
 def _measured(surface: Discretization, fields) -> dict[str, Any]:
     cloud = surface.cloud
-    height = jnp.sum(cloud.points * cloud.normals, axis=1)
+    none = jnp.full((), jnp.nan, cloud.points.dtype)
     return {
         "n": jnp.asarray(cloud.n if cloud.active is None else jnp.sum(cloud.active)),
         "area": jnp.sum(surface.areas),
-        "volume": surface.integrate(height) / cloud.dim,
+        "volume": volume(surface) if surface.border is None else none,
         "mass": jax.tree.map(surface.integrate, fields),
     }

@@ -109,6 +109,8 @@ CALLS = [
     ("evolve", "a problem of others", lambda: evolve(fields=jnp.ones(N), problem=lambda s: heat(js.discretize(js.sphere(70), method=js.GFDM(degree=2)))), ("problem", "70", "60")),
     ("evolve", "a wave of one field", lambda: evolve(fields=jnp.ones(N), problem=lambda s: js.WaveEquation(s.laplacian)), ("fields", "2 arrays")),
     ("evolve", "two species as a pair", lambda: evolve(fields=(jnp.ones(N), jnp.ones(N)), problem=heat), ("fields is a tuple of 2", "AdvectionDiffusionReaction", "(n, c)", "columns")),
+    ("evolve", "a wave of two shapes", lambda: evolve(fields=(jnp.ones(N), jnp.ones((N, 2))), problem=lambda s: js.WaveEquation(s.laplacian)), ("fields", "(60,)", "(60, 2)", "one shape")),
+    ("evolve", "a traced cloud", lambda: jax.jit(lambda x: evolve(cloud=js.PointCloud(x, x)).ts)(surface().cloud.points), ("cloud", "traced", "js.discretize(cloud, neighbors)")),
     ("evolve", "an adjoint as text", lambda: evolve(adjoint="forward"), ("adjoint", "forward", "ForwardMode")),
     ("evolve", "a velocity in NumPy", lambda: evolve(js.Motion(lambda t, s, f, a: np.sin(np.asarray(s.cloud.points)))), ("velocity", "jax.numpy")),
     ("adapt_points", "a spacing as large as the surface", lambda: js.adapt_points(surface(), js.Adaptation(3.0)), ("spacing", "are left", "too large", "polynomial")),

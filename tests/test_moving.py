@@ -69,6 +69,32 @@ def test_a_sphere_shrinks_by_its_curvature():
     assert float(turned.min()) > 1 - 1e-6
 
 
+@pytest.mark.parametrize("size, place", [(1.0, 0.0), (1.0, 1e3), (1e-6, 0.0), (1e6, -1e2)])
+def test_neither_place_nor_unit_of_length_makes_steps_coarse(size, place):
+    """A circle shrinks as r² = 1 - t, in units of its radius; tolerances are of those too."""
+    assert shrunk(size, place, float) < 1e-3
+
+
+def test_round_off_far_from_the_origin_shortens_no_steps():
+    """Single precision has 1e-5 radii left there, as large as the tolerance."""
+    assert shrunk(1.0, 100.0, np.float32) < 3e-3
+
+
+def shrunk(size, place, dtype):
+    circle = js.circle(60)
+    points = (size * (circle.points + place)).astype(dtype)
+    cloud = js.PointCloud(points, circle.normals.astype(dtype))
+    end = js.evolve(js.MeanCurvatureFlow(), cloud, t1=0.5 * size**2).clouds[-1]
+    radius = jnp.linalg.norm(end.points / size - place, axis=1)
+    return float(jnp.abs(radius / 0.5**0.5 - 1).max())
+
+
+def test_fields_below_the_tolerance_are_told():
+    """Beside points that are not."""
+    with pytest.warns(UserWarning, match=r"fields is at most .* errors of atol = 1e-07"):
+        grown(u=1e-9 * X, t1=0.1)
+
+
 @pytest.mark.slow
 def test_an_ellipsoid_that_keeps_its_volume_loses_area():
     surface = js.discretize(js.ellipsoid(200, (1.2, 1.0, 0.85)), method=js.GFDM(degree=2))
@@ -114,6 +140,13 @@ def test_steps_that_go_farther_than_the_neighbours_serve_are_shortened():
     normals = jnp.stack([X, Y, Z - X], axis=1)
     normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
     assert float(jnp.min(jnp.sum(normals * found.clouds[-1].normals, axis=1))) > 0.95
+
+
+def test_an_error_of_a_surface_says_when():
+    """A circle that is pressed flat, where a fold is seen when it is saved."""
+    flat = js.Motion(lambda t, surface, *_: surface.cloud.points * jnp.array([0.0, -3.0]))
+    with pytest.raises(ValueError, match=r"at t = 2: point \d+: .* a fold"):
+        js.evolve(flat, js.circle(60), t1=2.0)
 
 
 @pytest.mark.slow
@@ -344,6 +377,16 @@ def test_a_second_run_compiles_nothing():
         again = grown(rate=1.1 * RATE, **given)
     assert not names, names
     assert again.stats["steps"] == 2
+
+
+def test_the_volume_is_told_of_closed_surfaces_wherever_they_are():
+    still = js.Motion(lambda t, surface, *_: 0 * surface.cloud.points)
+    told = lambda cloud: js.evolve(still, cloud, t1=1.0).history["volume"][-1]
+    far = js.discretize(js.PointCloud(CLOUD.points + 1e4, CLOUD.normals), method=SURFACE.method)
+    np.testing.assert_allclose(told(far), js.volume(SURFACE), rtol=1e-8)
+    angles = jnp.linspace(0, jnp.pi, 40)
+    arc = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
+    assert np.isnan(told(js.PointCloud(arc, arc, boundary=np.arange(40) % 39 == 0)))
 
 
 def test_progress_bar(capfd):

@@ -109,3 +109,33 @@ def test_what_functions_close_over_is_differentiated_too():
         np.testing.assert_allclose(jax.value_and_grad(f)(1.0), [1.1, 0.1], rtol=1e-9)
     with pytest.raises(ValueError, match="adapt needs concrete arrays"):
         jax.grad(lambda a: closed(a, adapt=js.Adaptation(0.16)))(1.0)
+
+
+def test_forward_mode_and_derivatives_in_the_end():
+    r"""A circle of radius $1 + a t$."""
+    surface = js.discretize(js.circle(40), method=js.GFDM(degree=2))
+    motion = js.Motion(lambda t, surface, fields, args: args * surface.cloud.normals)
+    radius = lambda a, t, **given: (
+        js.evolve(motion, surface, t1=t, args=a, **given).clouds[-1].points[0, 0]
+    )
+    forward = lambda a: radius(a, 0.1, adjoint=dfx.ForwardMode())
+    np.testing.assert_allclose(jax.jvp(forward, (1.0,), (1.0,)), [1.1, 0.1], rtol=1e-9)
+    slopes = jax.grad(radius, argnums=(0, 1))(1.0, 0.1)
+    np.testing.assert_allclose(slopes, [0.1, 1.0], rtol=1e-6)
+
+
+def test_times_that_are_traced_and_arrays_of_times_in_compiled_code():
+    surface = js.discretize(js.circle(40), method=js.GFDM(degree=2))
+    motion = js.Motion(lambda t, surface, fields, args: args * surface.cloud.normals)
+
+    def radii(a, times):
+        run = js.evolve(motion, surface, t1=0.1, saveat=times, args=a, **STEPS)
+        return run.ts, jnp.stack([cloud.points[0, 0] for cloud in run.clouds])
+
+    times = jnp.array([0.0, 0.05, 0.1])
+    ts, found = jax.jit(lambda a: radii(a, times))(1.0)
+    assert ts.tolist() == times.tolist()
+    np.testing.assert_allclose(found, 1 + times, rtol=1e-9)
+    ts, found = jax.jit(lambda times: radii(1.0, times))(times[:2])
+    assert ts.tolist() == times.tolist()
+    np.testing.assert_allclose(found, 1 + times, rtol=1e-9)

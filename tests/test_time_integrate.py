@@ -109,6 +109,14 @@ def test_the_gradient_is_the_same_with_few_copies_of_the_state():
     np.testing.assert_allclose(few, many, rtol=1e-12, atol=1e-15)
 
 
+def test_derivatives_in_start_and_end_where_solutions_may_grow():
+    """d/dt1 and d/dt0 of the decay by diffusion and reaction, at rate 2 + 1."""
+    problem = js.AdvectionDiffusionReaction(LAPLACIAN, reaction=lambda t, u, args: -u)
+    end = lambda times: jnp.vdot(Z, js.integrate(problem, Z, t0=times[0], t1=times[1]).ys[-1])
+    value, slopes = jax.value_and_grad(end)(jnp.array([0.1, 0.3]))
+    np.testing.assert_allclose(slopes, 3 * value * jnp.array([1, -1]), rtol=1e-2)
+
+
 # --- failures ------------------------------------------------------------------------------
 
 

@@ -13,15 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ..arguments import as_float, as_many, finite, instance, real, switched_off
+from ..arguments import as_float, as_many, finite, instance, is_array, real, switched_off
 from ..cloud import PointCloud
+from ..design.functionals import volume
 from ..discretization import Discretization, discretize
-from ..failures import is_concrete, raise_at, refuse
+from ..failures import is_concrete, needs_values, raise_at, refuse, without_derivatives
 from ..kept import Kept
 from ..motion import CODES
 from ..stencils.method import AbstractMethod
 from ..stencils.usual import USUAL
-from ..time.asked import check_coefficients
+from ..time.asked import check_coefficients, tell_small
 from ..time.checkpoint import Checkpoint
 from ..time.higher import WaveEquation
 from ..time.integrate import integrate
@@ -89,7 +90,7 @@ class Evolution(eqx.Module):
     def history(self) -> dict[str, Any]:
         r"""Number of points, area, enclosed volume and integrals of the fields at each time.
 
-        The volume is $\\tfrac1d\\int x\\cdot n$, of closed surfaces. With adaptation also `events`.
+        The volume is `js.volume` of closed surfaces, NaN of others. With adaptation also `events`.
         Raises what `areas` does.
         """
         rows = [_measured(*row) for row in self.rows]
@@ -126,6 +127,7 @@ def evolve(
     rtol: float = 1e-5,
     atol: float = 1e-7,
     args: Any = None,
+    adjoint: dfx.AbstractAdjoint | None = None,
     adapt: Adaptation | None = None,
     contact: Contact | None = None,
     checkpoint: Checkpoint | None = None,
@@ -149,11 +151,13 @@ def evolve(
             conserves is diluted as the surface grows; of a `WaveEquation` that is
             $\partial_t u$. If None, fields go with the points unchanged.
         method: of the operators; `GFDM(degree=4)` if None, or that of a surface given.
-        saveat: times to save; t1 is always saved.
+        saveat: times to save; t1 is always saved (beside traced times once more).
         solver, dt0, rtol, atol: as for `integrate`; the solver that suits motion and problem if
-            None.
+            None. Of positions the tolerances are relative to the surface: as if its middle were the
+            origin, and the root mean square of the distances from there the unit of length.
         args: handed to velocity, reactions and forcings: what is differentiated goes in here, or
             in `cloud` and `fields`.
+        adjoint: how to differentiate, as for `integrate`.
         adapt: add points in holes and merge those that crowd, at the start and on the way. What
             the problem, the velocity or a spacing takes must then not have one row per point, but
             be computed from the surface; the support of operators follows from the neighbours.
@@ -170,12 +174,12 @@ def evolve(
 
     Accuracy: in time that of the solver; in space that of the method; in float32 points are within
         1e-5 (`tests/test_moving.py`).
-    Differentiable: forward and reverse, under `jit`, with the neighbours that there were at t0,
-        which must then serve until t1. For longer, in parts: from `surface.moved(points, normals,
-        search=search)`, with neighbours found anew. What the host decides, by `adapt` and
-        `contact`, has no derivative; across points that were added it is that of a surface whose
-        new points are carried by those around them, `surface.interpolate`
-        (`tests/test_moving_gradients.py`). It is not defined across a cut.
+    Differentiable: reverse (forward with `adjoint=diffrax.ForwardMode()`), under `jit`, with the
+        neighbours that there were at t0, which must then serve until t1. For longer, in parts: from
+        `surface.moved(points, normals, search=search)`, with neighbours found anew. What the host
+        decides, by `adapt` and `contact`, has no derivative; across points that were added it is
+        that of a surface whose new points are carried by those around them,
+        `surface.interpolate` (`tests/test_moving_gradients.py`). It is not defined across a cut.
     Raises:
         TypeError: arguments of other kinds.
         ValueError: wrong shapes; times that are not in order; on concrete arrays a surface that
@@ -204,7 +208,7 @@ def evolve(
     field = lambda u: finite(switched_off(on, as_float(u, "fields", (n, ...))), "fields")
     fields = jax.tree.map(field, fields)
     _check_types(fields, surface.cloud.points)
-    concrete = is_concrete(surface, fields, args, t0, t1, motion)
+    concrete = is_concrete(surface, fields, args, t0, t1, saveat, motion)
     if motion.derivatives and concrete:
         _check_closed(motion, surface)
     looked: dict[str, Any] = {"adapt": adapt, "contact": contact, "checkpoint": checkpoint}
@@ -223,9 +227,11 @@ def evolve(
             )
         _check_problem(checked_problem(problem(surface)), fields, surface.n)
         check_coefficients(problem(surface), t0, t1)
+        if dt0 is None:
+            tell_small(fields, atol, "fields")
     if concrete:
         motion.check(t0, surface, fields, args)
-    options = dict(solver=solver, dt0=dt0, rtol=rtol, atol=atol, args=args)
+    options = dict(solver=solver, dt0=dt0, rtol=rtol, atol=atol, args=args, adjoint=adjoint)
     moving, state = Moving.of(surface, motion, problem), joined(surface.cloud.points, fields)
     if checkpoint is not None:
         instance(checkpoint, Checkpoint, "checkpoint", "js.Checkpoint(path, every=...)")
@@ -270,9 +276,19 @@ def _check_problem(made: AbstractEvolution, fields, n: int) -> None:
         as_many("problem makes operators", made.n, "the surface", n)
     if not jax.tree.leaves(fields):
         raise ValueError("problem is given, but no fields: fields = () has 0 arrays, at least 1")
-    if isinstance(made, WaveEquation) and not (isinstance(fields, tuple) and len(fields) == 2):
-        kind = type(fields).__name__
-        raise ValueError(f"fields is a {kind}, a wave needs 2 arrays: values and velocities")
+    kind = type(fields).__name__
+    if isinstance(made, WaveEquation):
+        if not (isinstance(fields, tuple) and len(fields) == 2):
+            raise ValueError(f"fields is a {kind}, a wave needs 2 arrays: values and velocities")
+        value, rate = map(jnp.shape, fields)
+        if value != rate:
+            raise ValueError(f"fields of a wave have shapes {value} and {rate}, expected one shape")
+    elif made.n is not None and not is_array(fields):
+        count = len(jax.tree.leaves(fields))
+        raise ValueError(
+            f"fields is a {kind} of {count}, {type(made).__name__} has 1 array, (n,) or (n, c): "
+            "several species are its columns"
+        )
 
 
 def _discretized(motion, cloud, method) -> Discretization:
@@ -281,6 +297,8 @@ def _discretized(motion, cloud, method) -> Discretization:
             raise ValueError(f"method = {method!r}, but the surface given has {cloud.method!r}")
         return cloud
     instance(cloud, PointCloud, "cloud", "js.PointCloud(points, normals), or js.discretize(cloud)")
+    known = without_derivatives(cloud)
+    needs_values("cloud", known, instead="under jit and vmap pass js.discretize(cloud, neighbors)")
     return discretize(cloud, method=USUAL if method is None else method)
 
 
@@ -304,6 +322,8 @@ def _times(t0, t1, saveat) -> list:
         real(value, name)
     if isinstance(saveat, str) or not (saveat is None or np.iterable(saveat)):
         raise TypeError(f"saveat is a {type(saveat).__name__}, expected a sequence of times")
+    if is_array(saveat) and is_concrete(saveat):
+        saveat = np.asarray(saveat)  # whose entries are numbers, also in compiled code
     saved = [] if saveat is None else list(saveat)
     for value in saved:
         real(value, "saveat")
@@ -312,7 +332,7 @@ def _times(t0, t1, saveat) -> list:
     values = np.asarray([float(t0), *map(float, saved), float(t1)])
     if not values[-1] > values[0]:
         raise ValueError(f"t1 = {values[-1]:g}, expected above t0 = {values[0]:g}")
-    text = "saveat turns back after {v} (entry {i}), or leaves the run from t0 to t1"
+    text = "saveat does not rise after {v} (entry {i}), or leaves the run from t0 to t1"
     raise_at(np.diff(values)[1:-1] <= 0, text, values[1:-2])
     raise_at(
         (values[1:-1] < values[0]) | (values[1:-1] > values[-1]),
@@ -348,10 +368,10 @@ def _kept(moving: Moving, state, t, times, options) -> Evolution:
 
 def _measured(surface: Discretization, fields) -> dict[str, Any]:
     cloud = surface.cloud
-    height = jnp.sum(cloud.points * cloud.normals, axis=1)
+    none = jnp.full((), jnp.nan, cloud.points.dtype)
     return {
         "n": jnp.asarray(cloud.n if cloud.active is None else jnp.sum(cloud.active)),
         "area": jnp.sum(surface.areas),
-        "volume": surface.integrate(height) / cloud.dim,
+        "volume": volume(surface) if surface.border is None else none,
         "mass": jax.tree.map(surface.integrate, fields),
     }

@@ -160,7 +160,7 @@ def _ends(start, end, every: float) -> np.ndarray:
 
 def _digest(moving: Moving, state, start, times, options, kinds, checkpoint: Checkpoint) -> str:
     """Of all that a run hangs on; functions by what they compute."""
-    unset = dict.fromkeys(("controller", "saveat", "event", "adjoint", "max_steps"))
+    unset = dict.fromkeys(("controller", "saveat", "event", "max_steps"))
     plan = planned(moving, state, start, times[-1], **options, **unset, progress=False, throw=True)
     adapt = kinds[0]
     if adapt is not None and callable(adapt.spacing):
@@ -206,7 +206,8 @@ class _Run:
 
     @property
     def saved(self) -> _Place:
-        surface = self.moving.surface_at(self.state[0])
+        with self.when():
+            surface = self.moving.surface_at(self.state[0])
         # What was wrong with it would have been an error.
         surface = eqx.tree_at(lambda s: s.found, surface, None, is_leaf=lambda x: x is None)
         fields = self.moving.fields(self.t, self.state, self.options["args"])
@@ -225,10 +226,9 @@ class _Run:
             start, uneven = surface.cloud.points, self.adapt is not None
             event = dfx.Event(_Worn(start, neighbors, self.free, uneven))
             solution, reached, new = self.stretch(end, event)
-            steps, refused = (
-                int(solution.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected")
-            )
-            self.solver = solution.stats["solver"]
+            stats = solution.stats
+            steps, refused = (int(stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected"))
+            self.solver = stats["solver"]
             left = reached - self.t > _LEAST * (target - self.t)
             if left and (
                 np.any(unreached(start, new[0], neighbors))

@@ -24,6 +24,7 @@ from ..time.implicit import IMEX
 from ..time.problem import AbstractEvolution
 from .contact import Faced
 from .motions import AbstractMotion
+from .tolerances import RelativeToSurface
 
 
 class Moving(AbstractEvolution):
@@ -97,6 +98,9 @@ class Moving(AbstractEvolution):
         if self.on is None:
             return dfx.Tsit5(), "Tsit5: a velocity without derivatives is not stiff"
         return self.on(self.surface).suggested_solver()
+
+    def controller(self, rtol, atol, shortest):
+        return RelativeToSurface(rtol, atol, dtmin=shortest, force_dtmin=False, active=self.active)
 
     def rate(self, t, u, args):
         points, fields = parted(u)

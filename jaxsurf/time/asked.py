@@ -154,15 +154,16 @@ def check_coefficients(problem: AbstractEvolution, t0, t1) -> None:
         problem.check(t1)
 
 
-def tell_small(u0, atol) -> None:
+def tell_small(u0, atol, name: str = "u0") -> None:
     """Warn of a state that is smaller than the errors that are allowed."""
     if not is_concrete(u0, atol):
         return
-    most = max(float(np.max(np.abs(x), initial=0)) for x in map(np.asarray, jax.tree.leaves(u0)))
+    sizes = (float(np.max(np.abs(x), initial=0)) for x in map(np.asarray, jax.tree.leaves(u0)))
+    most = max(sizes, default=0.0)
     if 0 < most <= atol:
         warn(
-            f"u0 is at most {most:.2g} in size and errors of atol = {float(atol):.2g} are allowed: "
-            "the solution may be lost in them; pass a smaller atol"
+            f"{name} is at most {most:.2g} in size and errors of atol = {float(atol):.2g} are "
+            "allowed: the solution may be lost in them; pass a smaller atol"
         )
 
 

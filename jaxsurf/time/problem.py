@@ -32,9 +32,10 @@ class AbstractEvolution(eqx.Module):
     to free points, the equation is $\partial_t u = P\,(L + R)(E u + e)$.
 
     A problem of one's own defines `linear` and `rest` and, unless its state is a single field,
-    how to fill in conditions (`closed`). It may say which solver suits it (`suggested_solver`) and
-    what multigrid is to invert for it (`factors`). Where geometry is part of the state, `at` makes
-    of it what `linear` and `rest` then use.
+    how to fill in conditions (`closed`). It may say which solver suits it (`suggested_solver`),
+    what tolerances are relative to (`controller`) and what multigrid is to invert for it
+    (`factors`). Where geometry is part of the state, `at` makes of it what `linear` and `rest`
+    then use.
 
     Example:
         >>> class Decay(js.AbstractEvolution):
@@ -118,6 +119,10 @@ class AbstractEvolution(eqx.Module):
     def suggested_solver(self) -> tuple[dfx.AbstractSolver, str]:
         """A solver that suits the kind of problem, and why; by its kind, not by its values."""
         return IMEX(order=3), "IMEX(order=3): a linear part of unknown stiffness"
+
+    def controller(self, rtol, atol, shortest) -> dfx.AbstractAdaptiveStepSizeController:
+        """Of the lengths of steps by tolerances of their errors; none is below the shortest."""
+        return dfx.PIDController(rtol, atol, dtmin=shortest, force_dtmin=False)
 
     def factors(self, g: Array, u0: PyTree[Array]) -> PyTree[Array] | None:
         r"""Multigrid inverts $1 - g L \approx \prod_i (1 - s_i \Delta)$: the $s_i$.

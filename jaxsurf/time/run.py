@@ -198,9 +198,9 @@ def planned(
     if controller is None and dt0 is None:
         within_round_off(rtol, t0.dtype)
         real(atol, "atol", least=0)
-        tell_small(u0, atol)
-        shortest = _shortest(t0, t1)
-        controller = dfx.PIDController(rtol, atol, dtmin=shortest, force_dtmin=False)
+        if type(problem).controller is AbstractEvolution.controller:  # of errors as they are
+            tell_small(u0, atol)
+        controller = problem.controller(rtol, atol, _shortest(t0, t1))
     elif controller is None:
         controller = dfx.ConstantStepSize()
     check_tolerances(controller, t0.dtype)
@@ -221,7 +221,7 @@ def planned(
         )  # fmt: skip
         event = _ending(event, arrays, now, told)
     saveat = _saving(saveat, arrays, now)
-    limit = _limit(*constant((u0, jnp.asarray(problem._grows, t0.dtype))), t0, t1)
+    limit = _limit(*constant((u0, jnp.asarray(problem._grows, t0.dtype), t0, t1)))
     parts = (terms, solver, t0, t1, dt0, u0, args, controller, limit, saveat, event, adjoint)
     concrete = is_concrete(parts)  # also not inside a `jit`, which would make the limit traced
     _log.info("%s over [%s, %s] by %s", type(problem).__name__, t0, t1, why)

@@ -83,7 +83,9 @@ def geodesic_distance(
     more points: heat for a time of the size of h² is not resolved, whatever h. Where fronts meet
     first order: 7e-3 from five sources (`tests/test_geodesic.py`,
     `python -m experiments run geodesics`). On surfaces with a border and on random points 1e-2 to
-    4e-2 with 2,000 points (tested there too). Not yet shown for methods above second order.
+    4e-2 with 2,000 points (tested there too). First order on
+    curves, 1e-2 with 200 even or graded points; on 300 random points of a circle, whose gaps are up
+    to six spacings, 5e-2 to 0.4. Not yet shown for methods above second order.
     In float32 within 1e-4 of that, in l2 (`test_single_precision` there).
     Differentiable: forward and reverse, in points and normals, for fixed neighbours.
     Raises:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from . import curvature, operators, quadrature
 from .arguments import as_float, as_many, finite, instance, switched_off
 from .borders.border import Border
-from .borders.order import find_border
+from .borders.order import marked_border
 from .build import choose_neighbors
 from .cloud import PointCloud
 from .failures import is_concrete, needs_values, without_derivatives
@@ -379,7 +379,7 @@ def discretize(
     Differentiable: forward and reverse, in points and normals, for fixed neighbours.
     Raises:
         TypeError: no cloud, neighbours or method.
-        ValueError: as `choose_neighbors` and `find_border`.
+        ValueError: as `choose_neighbors` and `find_border`; a traced cloud with a border.
 
     Example:
         >>> surface = js.discretize(js.sphere(1_000), method=js.GFDM(degree=4))
@@ -394,7 +394,4 @@ def discretize(
     if neighbors is None:
         neighbors = choose_neighbors(cloud, method=method)
     instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
-    neighbors, border = switched_on(cloud, neighbors), None
-    if cloud.boundary is not None and (np.asarray(cloud.boundary) & cloud.host_active).any():
-        border = find_border(cloud)
-    return Discretization(cloud, neighbors, method, border)
+    return Discretization(cloud, switched_on(cloud, neighbors), method, marked_border(cloud))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from .borders.order import find_border, inward
 from .boundary import Closure, Source, check_pivots
 from .build import residual_tolerance, stencil_weights
 from .cloud import PointCloud
-from .compiling import copying_jit, namespace, sized_jit
+from .compiling import at_once, copying_jit, namespace, on_device, sized_jit
 from .conditions import Condition, checked_conditions
 from .discretization import Discretization
 from .failures import is_concrete, needs_values, raise_at
@@ -102,23 +103,23 @@ def eliminate(
             continue
         a = jnp.broadcast_to(condition.a, condition.m)[own].astype(dtype)
         if condition.b is None:
-            pivot, slots, weights = a, jnp.zeros((0, m), jnp.int32), jnp.zeros((0, m), dtype)
+            pivot, slots, weights = a, np.zeros((0, m), np.int32), jnp.zeros((0, m), dtype)
         else:
             b = jnp.broadcast_to(condition.b, condition.m)[own].astype(dtype)
             nu = _conormals(cloud, condition, rows, own, border)
             near = _free_neighbors(cloud, rows, free, neighbors, method)
             w, residual = _outward_derivative(cloud, near, rows, nu, method)
-            pivot, slots, weights = a + b * w[0], near.indices.T[1:], -b * w[1:]
+            pivot, slots, weights = a + b * w[0], np.asarray(near.indices).T[1:], -b * w[1:]
             if throw and is_concrete(w, a, b):
                 size = np.abs(a) + np.abs(b) * np.abs(w).sum(axis=0)
                 _check_stencils(rows, near, residual, method, cloud.dim)
                 check_pivots(pivot, size, rows, "value at point {i}: a + b w_i")
         parts.append((rows, slots, weights / pivot))
-        place = jnp.arange(start, start + m)
-        sources.append(Source(place, 1 / pivot, jnp.asarray(np.flatnonzero(own)), condition))
+        place, pick = on_device(np.arange(start, start + m)), on_device(np.flatnonzero(own))
+        sources.append(Source(place, 1 / pivot, pick, condition))
         start += m
     rows, indices, weights = stacked(parts, int(np.argmax(free)), dtype)
-    return Closure(cloud.n, rows, indices, weights, tuple(sources), jnp.asarray(declared))
+    return Closure(cloud.n, rows, indices, weights, tuple(sources), on_device(declared))
 
 
 def without_flux(surface: Discretization) -> Closure | None:
@@ -156,13 +157,16 @@ def without_flux(surface: Discretization) -> Closure | None:
     if border is None:
         return None
     rows = border.points
-    near, others, bound = _without_bound(neighbors, rows)
+    # Lists that are known stay so where points are traced, as `solve` has to know them.
+    known = is_concrete(neighbors, rows)
+    with at_once() if known else nullcontext():
+        near, others, bound = _without_bound(neighbors, rows)
     w, residual = _outward_derivative(cloud, near, rows, border.conormals(cloud), method)
     if is_concrete(w):
-        names, known = np.asarray(rows), np.asarray(w)
+        names, found = np.asarray(rows), np.asarray(w)
         _check_stencils(names, near, residual, method, cloud.dim)
-        size = np.abs(known).sum(axis=0)
-        check_pivots(known[0], size, names, "value at point {i}: the weight w_i of its derivative")
+        size = np.abs(found).sum(axis=0)
+        check_pivots(found[0], size, names, "value at point {i}: the weight w_i of its derivative")
     return Closure(cloud.n, rows, others, _shares(w), (), bound)
 
 
@@ -247,15 +251,19 @@ def check_parts(cloud, neighbors, border) -> None:
 
 
 def stacked(parts, free: int, dtype):
-    """One table of rows, indices and weights; padding refers to a free point."""
-    nothing = (np.zeros(0, np.int32), jnp.zeros((0, 0), jnp.int32), jnp.zeros((0, 0), dtype))
+    """One table of rows, indices and weights; padding refers to a free point.
+
+    Who refers to whom is concrete in traced code too, where `solve` has to know it.
+    """
+    nothing = (np.zeros(0, np.int32), np.zeros((0, 0), np.int32), jnp.zeros((0, 0), dtype))
     parts = parts or [nothing]
     k = max(len(slots) for _, slots, _ in parts)
     padding = lambda x: ((0, k - len(x)), (0, 0))
     rows = np.concatenate([rows for rows, _, _ in parts])
-    indices = [jnp.pad(jnp.asarray(s), padding(s), constant_values=free) for _, s, _ in parts]
+    indices = [np.pad(s, padding(s), constant_values=free) for _, s, _ in parts]
     weights = [jnp.pad(w, padding(w)) for _, _, w in parts]
-    return jnp.asarray(rows), jnp.concatenate(indices, axis=1), jnp.concatenate(weights, axis=1)
+    table = np.concatenate(indices, axis=1)
+    return on_device(rows), on_device(table), jnp.concatenate(weights, axis=1)
 
 
 def _conormals(cloud, condition, rows, own, border) -> Float[Array, "m d"]:
@@ -320,7 +328,7 @@ def _free_neighbors(cloud, rows, free, neighbors, method) -> Rows:
     text = f"point {{i}} has {{v}} free neighbours, {method} needs at least {need - 1} besides "
     raise_at(count < need, f"{text}the point itself", count - 1, points=rows)
     indices = np.where(mask, indices, indices[:, 1:2])
-    return Rows(jnp.asarray(indices), jnp.asarray(mask), radius)
+    return Rows(on_device(indices), on_device(mask), radius)
 
 
 def _nearest_free(cloud, rows, free, k):

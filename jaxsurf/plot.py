@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from jaxsurf.arguments import instance, on_host, real, whole
 from jaxsurf.cloud import PointCloud
-from jaxsurf.failures import raise_at
+from jaxsurf.failures import needs_values, raise_at
 from jaxsurf.raster import CLAY, Raster, camera_of, rasterize
 
 if TYPE_CHECKING:
@@ -221,6 +221,7 @@ def values_of(field, cloud: PointCloud, name: str) -> np.ndarray:
 
 def check_arguments(cloud, cmap, limits, pixels) -> None:
     instance(cloud, PointCloud, "cloud", "js.PointCloud(points, normals) makes one")
+    needs_values("cloud", cloud, instead="draw outside jit, vmap and grad")
     whole(pixels, "pixels", least=1)
     if cmap is not None:
         from matplotlib import colormaps

@@ -389,6 +389,21 @@ def test_codes_say_what_would_be_an_error():
     assert code(line).any()
 
 
+def test_a_border_is_found_outside_compiled_code():
+    method = js.GFDM(degree=2)
+    surface = js.discretize(js.graph(lambda x, y: 0.3 * x * y, (8, 8)), method=method)
+    cloud, lists = surface.cloud, surface.neighbors
+    made = lambda cloud: js.discretize(cloud, lists, method=method).laplacian(cloud.points[:, 0])
+    with pytest.raises(ValueError, match=r"a cloud with a border must be concrete, not traced: ma"):
+        jax.jit(made)(cloud)
+    marked = lambda x: js.PointCloud(x, cloud.normals, boundary=cloud.boundary)
+    with pytest.raises(ValueError, match=r"a cloud with a border must be concrete, not traced: ma"):
+        jax.jit(lambda x: made(marked(x)))(cloud.points)
+    closed = lambda x: js.PointCloud(x, cloud.normals, boundary=jnp.zeros_like(cloud.boundary))
+    found = jax.jvp(lambda x: made(marked(x)), (cloud.points,), (cloud.points,))[0]
+    np.testing.assert_allclose(found, made(closed(cloud.points)), atol=1e-12)
+
+
 def test_compiled_code_refuses_what_is_an_error_outside():
     method = js.GFDM(degree=2)
     end = js.graph(lambda x, y: 0.3 * x * y, (16, 16))

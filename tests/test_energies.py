@@ -138,3 +138,19 @@ def test_methods_whose_gradient_is_too_coarse_keep_the_values_of_the_laplacian()
     u = js.solve(-surface.laplacian + 1.0, load, rtol=1e-10).value
     work = js.compliance(surface, load, screening=1.0)
     np.testing.assert_allclose(work, surface.inner(load, u), rtol=1e-8)
+
+
+def test_compliance_where_round_off_ends_the_solve():
+    """On a curve the condition grows with n², on a thin tube with its points along; both failed."""
+    n = 1_000
+    surface = js.discretize(js.circle(n))
+    t = 2 * jnp.pi * jnp.arange(n) / n
+    for screening in (0.0, 1.0):
+        work = js.compliance(surface, jnp.cos(t), screening=screening)
+        np.testing.assert_allclose(work, jnp.pi / (1 + screening), rtol=1e-11)
+    stretched = lambda a: surface.moved(a * surface.cloud.points)
+    slope = jax.grad(lambda a: js.compliance(stretched(a), jnp.cos(t)))(1.0)
+    np.testing.assert_allclose(slope, 3 * jnp.pi, rtol=1e-7)
+    tube = js.discretize(js.torus(4_000, 1.0, 0.02))
+    work = js.compliance(tube, tube.cloud.points[:, 0])  # almost that of a circle, times its girth
+    np.testing.assert_allclose(work, 0.04 * jnp.pi**2, rtol=1e-2)

@@ -95,6 +95,54 @@ def test_scale_and_far_points():
     np.testing.assert_allclose(found, 1e3 * distance, rtol=1e-6)
 
 
+@pytest.mark.parametrize("n", [100, 400, 3_000])
+def test_uneven_points_on_a_curve(n):
+    """An ellipse with half the spacing at its ends; from 3,000 points heat leaves all numbers."""
+    t = 2 * np.pi * np.arange(100 * n) / (100 * n)
+    x, normals = np.stack([2 * np.cos(t), np.sin(t)], 1), np.stack([np.cos(t), 2 * np.sin(t)], 1)
+    normals = normals / np.linalg.norm(normals, axis=1)[:, None]
+    arc = np.cumsum(np.linalg.norm(np.roll(x, -1, axis=0) - x, axis=1))
+    along, length = np.concatenate([[0], arc[99:-1:100]]), arc[-1]
+    cloud = js.PointCloud(x[::100], normals[::100])
+    for source in (0, n // 4):
+        exact = np.abs(along - along[source])
+        exact = np.minimum(exact, length - exact)
+        found = js.geodesic_distance(cloud, jnp.array([source]))
+        assert relative_error(found, exact) < 1.4 / n
+
+
+def test_graded_points():
+    """From where points are wide apart to where they are dense: 10 times too far before."""
+    side = np.linspace(0, 1, 40)
+    side = np.expm1(0.01 * side) / np.expm1(0.01)  # one per cent wider on the right
+    x, y = (c.ravel() for c in np.meshgrid(side, side, indexing="ij"))
+    points = np.stack([x, y, 0 * x], axis=1)
+    border = (x == 0) | (x == 1) | (y == 0) | (y == 1)
+    square = js.PointCloud(points, np.tile([0.0, 0, 1], (1_600, 1)), boundary=border)
+    exact = np.linalg.norm(points - points[-1], axis=1)
+    assert relative_error(js.geodesic_distance(square, jnp.array([1_599])), exact) < 2e-2
+
+    sphere = js.sphere(3_000)
+    angle = jnp.arccos(sphere.points[:, 2])
+    turned = jnp.arctan(3 * jnp.tan(angle / 2)) - angle / 2  # half of it: nine times as dense below
+    axis = jnp.stack([-sphere.points[:, 1], sphere.points[:, 0], 0 * angle], axis=1)
+    axis = axis / jnp.linalg.norm(axis, axis=1, keepdims=True)
+    points = sphere.points * jnp.cos(2 * turned)[:, None]
+    points = points + jnp.cross(axis, sphere.points) * jnp.sin(2 * turned)[:, None]
+    graded = js.PointCloud(points, points)
+    for source in (jnp.argmax(points[:, 2])[None], jnp.argmin(points[:, 2])[None]):
+        distance = js.geodesic_distance(graded, source)
+        assert relative_error(distance, exact_on_sphere(graded, source)) < 1.5e-2
+
+
+def test_what_is_not_found():
+    """In single precision 800 points in a row are too many for the tolerance."""
+    circle = js.circle(800)
+    circle = js.PointCloud(circle.points.astype("float32"), circle.normals.astype("float32"))
+    with pytest.raises(RuntimeError, match=r"^distances have not been found to a relative toler"):
+        js.geodesic_distance(circle, jnp.array([0]))
+
+
 def test_gradient_in_points_and_normals():
     cloud = js.ellipsoid(500, (1.0, 0.8, 0.65))
     method = js.GFDM(degree=2)

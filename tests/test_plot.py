@@ -1,5 +1,6 @@
 import sys
 
+import jax
 import matplotlib
 import numpy as np
 import PIL.Image
@@ -205,6 +206,8 @@ def test_bad_input():
         plot_cloud(cloud, view=(0, 0, 2))
     with pytest.raises(ValueError, match="no fields to draw"):
         plot_fields(cloud, {})
+    with pytest.raises(ValueError, match="cloud must be concrete, not traced: draw outside jit"):
+        jax.jit(plot_cloud)(cloud)
 
 
 def test_without_matplotlib(monkeypatch):

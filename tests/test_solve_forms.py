@@ -256,3 +256,36 @@ def test_single_precision(screened):
         assert slope.dtype == change.dtype == jnp.float32
         np.testing.assert_allclose(change, modes.values[0], rtol=1e-3)
     assert slope == pytest.approx(float(expected), rel=1e-3)
+
+
+def test_conditions_made_in_compiled_code():
+    """Who is bound and by whom is known there: a factor of a condition can be an unknown."""
+    patch = js.discretize(js.graph(lambda x, y: 0.3 * x * y, (12, 12)), method=GFDM)
+    points, border = patch.cloud.points, np.flatnonzero(patch.cloud.boundary)
+
+    def heat(kind):
+        def observed(a, stretch):
+            surface = patch.moved(stretch * points)
+            closures = {
+                "robin": lambda: js.eliminate(surface, js.robin(border, 1.0, a=a, b=1.0)),
+                "dirichlet": lambda: js.eliminate(surface, js.dirichlet(border, a)),
+                "without_flux": lambda: js.without_flux(surface),
+            }
+            operator, closure = a - surface.laplacian, closures[kind]()
+            u = js.solve(operator, points[:, 0] ** 2, closure=closure, mean_zero=False, rtol=1e-11)
+            return u.value @ points[:, 1] ** 2
+
+        return observed
+
+    for kind in ("robin", "dirichlet", "without_flux"):
+        plain, both = heat(kind), jax.value_and_grad(heat(kind), argnums=(0, 1))
+        found, slopes = jax.jit(both)(0.7, 1.1)
+        np.testing.assert_allclose(found, plain(0.7, 1.1), rtol=1e-9)
+        for slope, difference in zip(
+            slopes,
+            (
+                central_difference(lambda a, f=plain: f(a, 1.1), 0.7, 1.0, 1e-4),
+                central_difference(lambda s, f=plain: f(0.7, s), 1.1, 1.0, 1e-4),
+            ),
+        ):
+            np.testing.assert_allclose(slope, difference, rtol=1e-5)

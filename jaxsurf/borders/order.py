@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from ..arguments import instance
 from ..cloud import PointCloud
 from ..compiling import on_device
-from ..failures import needs_values, without_derivatives
+from ..failures import is_concrete, needs_values, without_derivatives
 from ..shapes.meshes import TriangleMesh
 from ..sheets import distance_key
 from .border import Border, checked_border
@@ -108,6 +108,21 @@ def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
             path = path[::-1]
         paths.append((names[path], closed))
     return _with_rows(cloud, paths)
+
+
+def marked_border(cloud: PointCloud) -> Border | None:
+    """The border of a cloud that has one; None where no point is marked."""
+    if cloud.boundary is None:
+        return None
+    known = is_concrete(cloud.boundary, cloud.active)
+    if known and not (np.asarray(cloud.boundary) & cloud.host_active).any():
+        return None
+    needs_values(
+        "a cloud with a border",
+        without_derivatives(cloud),
+        instead="make its surface outside jit and vmap, pass it, and take surface.moved(points)",
+    )
+    return find_border(cloud)
 
 
 def inward(points, on, border):

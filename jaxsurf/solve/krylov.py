@@ -33,9 +33,12 @@ class BiCGStab(lx.AbstractLinearSolver):
         rtol: tolerance relative to the norm of the right-hand side.
         atol: absolute tolerance.
         max_steps: most steps, of two products with the operator each.
+        enough: this share of the norm of the right-hand side is good enough where round-off ends
+            the iteration before its tolerance is reached.
 
     Raises:
-        ValueError: a tolerance that is negative or not finite, or rtol ≥ 1; max_steps < 1.
+        ValueError: a tolerance that is negative or not finite, or rtol or enough ≥ 1;
+            max_steps < 1.
         TypeError: no numbers.
 
     Example:
@@ -49,9 +52,11 @@ class BiCGStab(lx.AbstractLinearSolver):
     rtol: Any = 1e-8
     atol: Any = 0.0
     max_steps: Any = 1000
+    enough: Any = 0.0
 
     def __check_init__(self):
         real(self.rtol, "rtol", least=0, below=1)
+        real(self.enough, "enough", least=0, below=1)
         real(self.atol, "atol", least=0)
         if is_concrete(self.max_steps):
             whole(self.max_steps, "max_steps", least=1)
@@ -72,7 +77,8 @@ class BiCGStab(lx.AbstractLinearSolver):
         # At size one, as squares of 1e-300 are zero.
         scale = scale_of(b)
         b = b / scale
-        target = jnp.maximum(self.rtol * jnp.linalg.norm(b), self.atol / scale)
+        norm = jnp.linalg.norm(b)
+        target = jnp.maximum(self.rtol * norm, self.atol / scale)
         x, r = jnp.zeros_like(b), b
         if "y0" in options:
             x = ravel_pytree(options["y0"])[0] / scale
@@ -101,7 +107,8 @@ class BiCGStab(lx.AbstractLinearSolver):
         result = _Results.where(
             steps >= self.max_steps, _Results.max_steps_reached, _Results.stagnation
         )
-        result = _Results.where(size <= target, _Results.successful, result)
+        reached = size <= jnp.maximum(target, self.enough * norm)
+        result = _Results.where(reached, _Results.successful, result)
         result = _Results.where(finite, result, _Results.nonfinite_input)
         return unravel(scale * x), result, {"num_steps": steps, "max_steps": self.max_steps}
 

@@ -65,26 +65,27 @@ def detect_boundary(cloud: PointCloud, *, k: int = _RING, gap: float = _GAP) -> 
     points, normals = np.asarray(cloud.points, float)[rows], np.asarray(cloud.normals)[rows]
     k = min(k, len(rows)) if cloud.dim == 3 else 3
     tree, found = cKDTree(points), np.zeros(cloud.n, bool)
-    offsets, used = _flat_offsets(points, normals, tree, k)
+    tangents = np.asarray(tangent_frames(jnp.asarray(normals)))[:, :-1]
+    place = points, normals, tangents, tree
+    offsets, used = _flat_offsets(*place, k)
     if cloud.dim == 2:
         side = np.where(used, np.sign(offsets[..., 0]), 0)
         found[rows] = np.abs(side.sum(axis=1)) == used.sum(axis=1)
     else:
         some = np.flatnonzero(_largest_angle(offsets, used) > gap)
         spacing = np.sqrt(np.pi / k * np.sum(offsets[some, -1] ** 2, axis=1))
-        wide = _flat_offsets(points, normals, tree, min(max(k, _WIDE), len(rows)), some)
+        wide = _flat_offsets(*place, min(max(k, _WIDE), len(rows)), some)
         empty = _empty_radius(*wide) / spacing
         some, spacing, empty = (a[empty > _EMPTY] for a in (some, spacing, empty))
         found[rows[some]] = _of_pieces(points[some], _NEXT * spacing, empty > _SURELY)
     return jnp.asarray(found)
 
 
-def _flat_offsets(points, normals, tree, k, rows=slice(None)):
+def _flat_offsets(points, normals, tangents, tree, k, rows=slice(None)):
     """Offsets of k - 1 neighbours in the tangent planes, and which of them are used."""
     slots, mask = nearest(points, normals, tree, k, 0.0, rows=np.arange(len(points))[rows])
-    frames = np.asarray(tangent_frames(jnp.asarray(normals)))[rows, :-1]
     offsets = points[slots[:, 1:]] - points[rows][:, None]
-    return np.einsum("nkd,ntd->nkt", offsets, frames), mask[:, 1:]
+    return np.einsum("nkd,ntd->nkt", offsets, tangents[rows]), mask[:, 1:]
 
 
 def _largest_angle(offsets, used):

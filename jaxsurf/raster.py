@@ -15,7 +15,7 @@ CLAY = (0.83, 0.80, 0.75)
 _DISK = 1.35
 # Sum of disk weights that makes a pixel part of the surface: about 1.9 inside, half on a border.
 _COVER = 0.6
-# Sine of how far over the horizon points are taken to support the outline.
+# Sine of how far over the horizon points still support the outline of the side that is seen.
 _RIM = 0.5
 # Rendered finer than shown and averaged, for smooth outlines.
 _FINER = 2
@@ -69,7 +69,7 @@ def camera_of(view, up) -> np.ndarray:
     return np.stack([right, np.cross(toward, right), toward])
 
 
-def rasterize(points, normals, *, closed: bool, camera, pixels: int) -> Raster:
+def rasterize(points, normals, *, camera, pixels: int) -> Raster:
     x, normal = points @ camera.T, normals @ camera.T
     radius = _DISK * _spacing(points)
     margin = np.median(radius)
@@ -77,9 +77,8 @@ def rasterize(points, normals, *, closed: bool, camera, pixels: int) -> Raster:
     step = float((high - low).max()) / (pixels * _FINER)
     columns, rows = np.ceil((high - low) / step / _FINER).astype(int) * _FINER
     size = rows * columns
-    chosen = np.flatnonzero(normal[:, 2] > -_RIM) if closed else np.arange(len(x))
     radius = np.maximum(radius, 1.5 * step)
-    pairs = _covered(chosen, x, normal, radius, low, step, (columns, rows))
+    pairs = _covered(x, normal, radius, low, step, (columns, rows))
     pixel, point, share = _front(*pairs, side=normal[:, 2], radius=radius, size=size)
     sums = [np.bincount(pixel, share * c[point], minlength=size) for c in normal.T]
     mean = np.stack(sums, axis=1).astype(np.float32)
@@ -134,7 +133,7 @@ def _spacing(points):
     return cKDTree(points).query(points, k=k)[0][:, 1:].mean(axis=1)
 
 
-def _covered(chosen, x, normal, radius, low, step, shape):
+def _covered(x, n, r, low, step, shape):
     """Pairs of pixel and point where the point's tangent disk covers the pixel.
 
     A disk covers, in each row of pixels, those between the ends of a chord of the ellipse that is
@@ -143,7 +142,6 @@ def _covered(chosen, x, normal, radius, low, step, shape):
     Returns pixel, point, squared distance on the disk in units of its radius, and depth.
     """
     columns, rows = shape
-    x, n, r = x[chosen], normal[chosen], radius[chosen]
     # Disks seen from the side keep some thickness, or they would leave gaps.
     slope = -n[:, :2] / np.copysign(np.maximum(np.abs(n[:, 2:]), 0.15), n[:, 2:])
     # Squared distance on the disk: a dx² + 2 b dx dy + c dy².
@@ -168,7 +166,7 @@ def _covered(chosen, x, normal, radius, low, step, shape):
     far = np.minimum((a * dx + b) * dx + c, np.float32(1))
     depth = rise.astype(np.float32)[chord] + slope[:, 0].astype(np.float32)[chord] * dx
     pixel = (row * columns).astype(np.int32)[chord] + column
-    return pixel, chosen.astype(np.int32)[disk][chord], far, depth
+    return pixel, disk[chord], far, depth
 
 
 def _expanded(first, last):

@@ -53,6 +53,21 @@ def test_sphere_is_a_closed_disk(n):
     assert (covered[inside] == 1).all()
 
 
+def test_an_open_surface_is_seen_from_inside():
+    """Whether or not its border is marked."""
+    whole = sphere(4_000)
+    bowl = whole.points[:, 2] < 0
+    cloud = PointCloud(whole.points[bowl], whole.normals[bowl])
+    options = {"view": (0, 0, 1), "up": (0, 1, 0), "pixels": 200}
+    image, (width, height) = picture(plot_cloud(cloud, cloud.points[:, 0], **options))
+    covered = image[..., 3]
+    assert abs(covered.sum() * width * height / covered.size / np.pi - 1) < 0.05
+    h, w, _ = image.shape
+    assert (covered[h // 4 : -h // 4, w // 4 : -w // 4] == 1).all()
+    assert image[h // 2, w // 8, 2] > image[h // 2, w // 8, 0] + 0.1
+    assert image[h // 2, -w // 8, 0] > image[h // 2, -w // 8, 2] + 0.1
+
+
 def test_light_comes_from_the_upper_left():
     image, _ = picture(plot_cloud(sphere(3_000), pixels=200))
     brightness = image[..., :3].sum(axis=-1)

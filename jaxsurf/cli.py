@@ -43,10 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def sample():
         if options.surface is None:
             return demo.built_in_surface(10_000 if options.points is None else options.points)
-        points = 10_000 if options.points is None else options.points
         return demo.surface_from_file(
             options.surface,
-            None if points == "all" else points,
+            options.points,
             smooth=not options.flat,
             largest_part=options.largest_part,
             border=options.border,
@@ -98,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
         type=_points,
         metavar="N",
         help="sample the surface evenly with N points (default: 10000), or 'all' for the "
-        "vertices of the file as they are",
+        "vertices of the file as they are, which those without triangles always are",
     )
     one.add_argument(
         "--flat",

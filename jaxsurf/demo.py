@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -86,26 +86,31 @@ def _thickened(cloud: PointCloud, thickness: float | Float[Array, ""]) -> PointC
 
 def surface_from_file(
     path: str | Path,
-    n: int | None = 10_000,
+    n: int | Literal["all"] | None = None,
     *,
     smooth: bool = True,
     largest_part: bool = False,
     border: bool = False,
 ) -> Surface:
-    """A mesh resampled to n points, or a file's own points (n None, or no triangles in it).
+    """A mesh resampled to n points, or a file's own points.
 
     The size of the whole varies.
 
     Args:
+        n: "all" for the file's own; None for 10,000 of a mesh and all of what has no triangles.
         smooth, largest_part: for `read`, which states in warnings what it converts.
         border: for points without triangles: those that `detect_boundary` names are the border.
 
     Raises:
-        ValueError: a border asked for of triangles, which tell theirs, or where there is none.
+        ValueError: a number of points to resample what has no triangles; a border asked for of
+            triangles, which tell theirs, or where there is none.
     """
     has_triangles = bool(contents_of(path).faces)
-    n = n if has_triangles else None
-    cloud = read(path, n=n, smooth=smooth, largest_part=largest_part)
+    if isinstance(n, int) and not has_triangles:
+        raise ValueError(f"{path}: no triangles to sample {n} points on, leave the number out")
+    resampled = has_triangles and n != "all"
+    count = (n or 10_000) if resampled else None
+    cloud = read(path, n=count, smooth=smooth, largest_part=largest_part)  # type: ignore[arg-type]
     if border:
         if has_triangles:
             raise ValueError(f"{path}: triangles tell where the border is, leave `border` out")
@@ -113,7 +118,7 @@ def surface_from_file(
         if not found.any():
             raise ValueError(f"{path}: no point looks like a border point, leave `border` out")
         cloud = PointCloud(cloud.points, cloud.normals, boundary=found)
-    own = "its own points" if n is None else "resampled evenly"
+    own = "resampled evenly" if resampled else "its own points"
     moved = jax.tree_util.Partial(_scaled, cloud)
     # Scans are usually stored with y up.
     up, view = (0.0, 1.0, 0.0), (0.5, 0.5, 1.7)

@@ -108,14 +108,17 @@ def write_grid(path: Path) -> None:
 def test_surface_from_file(tmp_path):
     path = tmp_path / "grid.obj"
     write_grid(path)
-    own, even = demo.surface_from_file(path, None), demo.surface_from_file(path, 900)
+    own, even = demo.surface_from_file(path, "all"), demo.surface_from_file(path, 900)
     assert own.cloud.n == 1_600 and even.cloud.n == 900
     np.testing.assert_allclose(own.moved(2.0).points, 2 * own.cloud.points)
     assert int(own.cloud.boundary.sum()) == 4 * 39
     # A list of points has nothing to resample, and does not tell where its border is.
     cloud = js.sphere(300)
     js.write(tmp_path / "points.xyz", cloud)
-    assert demo.surface_from_file(tmp_path / "points.xyz", 100).cloud.n == 300
+    for n in (None, "all"):
+        assert demo.surface_from_file(tmp_path / "points.xyz", n).cloud.n == 300
+    with pytest.raises(ValueError, match="no triangles to sample 100 points on"):
+        demo.surface_from_file(tmp_path / "points.xyz", 100)
     with pytest.raises(ValueError, match="no point looks like a border point"):
         demo.surface_from_file(tmp_path / "points.xyz", border=True)
     with pytest.raises(ValueError, match="triangles tell where the border is"):

@@ -389,6 +389,21 @@ def test_the_volume_is_told_of_closed_surfaces_wherever_they_are():
     assert np.isnan(told(js.PointCloud(arc, arc, boundary=np.arange(40) % 39 == 0)))
 
 
+def test_a_surface_that_is_turned_inside_out_is_told():
+    """By steps over the moment at which it is a point: it is smooth on either side."""
+    inwards = js.Motion(lambda t, surface, *_: -surface.cloud.normals)
+    options = dict(dt0=0.75, solver=dfx.Euler())
+    with pytest.warns(UserWarning, match="inside out at t = 1.5: since t = 0"):
+        assert js.evolve(inwards, CLOUD, t1=1.5, **options).history["volume"][0] < 0
+    bowl = CLOUD.points[:, 2] < -0.3
+    bowl = js.PointCloud(CLOUD.points[bowl], CLOUD.normals[bowl])
+    flips = js.Motion(lambda t, surface, *_: -2 * surface.cloud.points.at[:, :2].set(0))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*inside out")
+        js.evolve(inwards, CLOUD, t1=0.75, **options)  # a ball still, if a small one
+        js.evolve(flips, bowl, t1=1.5, **options)  # nothing is inside
+
+
 def test_progress_bar(capfd):
     """In units of t, in few digits: 0.1 + 0.2 is 0.30000000000000004."""
     drift = js.Motion(lambda t, surface, fields, args: 0 * surface.cloud.normals)

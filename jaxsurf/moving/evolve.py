@@ -22,13 +22,15 @@ from ..kept import Kept
 from ..motion import CODES
 from ..stencils.method import AbstractMethod
 from ..stencils.usual import USUAL
-from ..time.asked import check_coefficients, tell_small
+from ..time.asked import check_coefficients
 from ..time.checkpoint import Checkpoint
 from ..time.higher import WaveEquation
 from ..time.integrate import integrate
 from ..time.problem import AbstractEvolution, checked_problem
+from ..time.states import tell_small
 from .adaptation import Adaptation, checked_adaptation
 from .contact import Contact, checked_contact
+from .eversion import tell_eversion
 from .follow import ClosesOverTraced, followed
 from .motions import AbstractMotion, checked_motion
 from .problem import Moving, joined, parted
@@ -154,7 +156,8 @@ def evolve(
         saveat: times to save; t1 is always saved (beside traced times once more).
         solver, dt0, rtol, atol: as for `integrate`; the solver that suits motion and problem if
             None. Of positions the tolerances are relative to the surface: as if its middle were the
-            origin, and the root mean square of the distances from there the unit of length.
+            origin, and the root mean square of the distances from there the unit of length; `atol`
+            is above zero.
         args: handed to velocity, reactions and forcings: what is differentiated goes in here, or
             in `cloud` and `fields`.
         adjoint: how to differentiate, as for `integrate`.
@@ -219,6 +222,8 @@ def evolve(
     if adapt is not None:
         surface, fields = _with_rows(surface, fields, adapt)
     times = _times(t0, t1, saveat)
+    if dt0 is None:
+        real(atol, "atol", above=0)  # coordinates pass through zero, where rtol allows no error
     if problem is not None:
         if not callable(problem) or isinstance(problem, AbstractEvolution):
             raise TypeError(
@@ -237,9 +242,12 @@ def evolve(
         instance(checkpoint, Checkpoint, "checkpoint", "js.Checkpoint(path, every=...)")
     if concrete:
         try:
-            return Evolution(
+            found = Evolution(
                 *followed(moving, state, t0, times, options, adapt, contact, checkpoint, progress)
             )
+            if surface.border is None:
+                tell_eversion(surface, t0, found.ts, [row[0] for row in found.rows])
+            return found
         except ClosesOverTraced:
             _refuse_looks(looked)
     return _kept(moving, state, t0, times, options)

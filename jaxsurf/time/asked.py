@@ -14,7 +14,7 @@ from jaxtyping import Array, PyTree
 
 from ..arguments import as_float, real, within_round_off
 from ..boundary import check_border
-from ..failures import check, is_concrete, not_finite, raise_at, warn
+from ..failures import check, is_concrete, not_finite, raise_at
 from .higher import WaveEquation
 from .problem import AbstractEvolution
 from .states import dtype_of, only_on
@@ -152,19 +152,6 @@ def check_coefficients(problem: AbstractEvolution, t0, t1) -> None:
     if is_concrete(t0, t1):
         problem.check(t0)
         problem.check(t1)
-
-
-def tell_small(u0, atol, name: str = "u0") -> None:
-    """Warn of a state that is smaller than the errors that are allowed."""
-    if not is_concrete(u0, atol):
-        return
-    sizes = (float(np.max(np.abs(x), initial=0)) for x in map(np.asarray, jax.tree.leaves(u0)))
-    most = max(sizes, default=0.0)
-    if 0 < most <= atol:
-        warn(
-            f"{name} is at most {most:.2g} in size and errors of atol = {float(atol):.2g} are "
-            "allowed: the solution may be lost in them; pass a smaller atol"
-        )
 
 
 def check_tolerances(controller: dfx.AbstractStepSizeController, dtype) -> None:

@@ -19,7 +19,7 @@ from ..failures import is_concrete
 from ..stencils.algebra import AbstractOperator
 from .coefficients import InTime
 from .implicit import IMEX
-from .states import added, only_on
+from .states import added, only_on, tell_small
 
 Field = Float[Array, "n *c"]
 
@@ -123,6 +123,10 @@ class AbstractEvolution(eqx.Module):
     def controller(self, rtol, atol, shortest) -> dfx.AbstractAdaptiveStepSizeController:
         """Of the lengths of steps by tolerances of their errors; none is below the shortest."""
         return dfx.PIDController(rtol, atol, dtmin=shortest, force_dtmin=False)
+
+    def tell_small(self, u0: PyTree[Array], atol) -> None:
+        """Warn of a state that is smaller than the errors that are allowed."""
+        tell_small(u0, atol, "u0")
 
     def factors(self, g: Array, u0: PyTree[Array]) -> PyTree[Array] | None:
         r"""Multigrid inverts $1 - g L \approx \prod_i (1 - s_i \Delta)$: the $s_i$.

@@ -25,7 +25,6 @@ from .asked import (
     checked_rate,
     checked_state,
     checked_times,
-    tell_small,
 )
 from .chebyshev import Loop
 from .explicit import RKC2
@@ -198,8 +197,7 @@ def planned(
     if controller is None and dt0 is None:
         within_round_off(rtol, t0.dtype)
         real(atol, "atol", least=0)
-        if type(problem).controller is AbstractEvolution.controller:  # of errors as they are
-            tell_small(u0, atol)
+        problem.tell_small(u0, atol)
         controller = problem.controller(rtol, atol, _shortest(t0, t1))
     elif controller is None:
         controller = dfx.ConstantStepSize()
@@ -236,7 +234,7 @@ def _check_estimates(solver: dfx.AbstractSolver, controller) -> None:
     if adaptive and not isinstance(solver, dfx.AbstractAdaptiveSolver):
         raise ValueError(
             f"solver={type(solver).__name__} estimates no error that would choose the steps: pass "
-            "their length as dt0, or the times of all as controller=diffrax.StepTo(...)"
+            "their length as dt0"
         )
 
 

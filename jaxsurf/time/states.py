@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..arguments import count_on, switched_off
+from ..failures import is_concrete, warn
 
 
 @jax.jit
@@ -33,6 +34,19 @@ def only_on(active: Bool[Array | np.ndarray, " n"] | None, tree: PyTree) -> PyTr
         return tree
     fields = lambda x: jnp.ndim(x) > 0 and jnp.shape(x)[0] == len(active)
     return jax.tree.map(lambda x: switched_off(active, x) if fields(x) else x, tree)
+
+
+def tell_small(u0, atol, name: str) -> None:
+    """Warn of a state that is smaller than the errors that are allowed."""
+    if not is_concrete(u0, atol):
+        return
+    sizes = (float(np.max(np.abs(x), initial=0)) for x in map(np.asarray, jax.tree.leaves(u0)))
+    most = max(sizes, default=0.0)
+    if 0 < most <= atol:
+        warn(
+            f"{name} is at most {most:.2g} in size and errors of atol = {float(atol):.2g} are "
+            "allowed: the solution may be lost in them; pass a smaller atol"
+        )
 
 
 class Norm(eqx.Module):

@@ -53,6 +53,8 @@ CALLS = [
     ("evolve", "a field of another type", lambda: evolve(fields=jnp.ones(N, jnp.float16)), ("fields", "float16", "points")),
     ("evolve", "a problem in place of a function", lambda: evolve(fields=jnp.ones(N), problem=heat(surface())), ("problem", "function", "surface")),
     ("evolve", "a function of no problem", lambda: evolve(fields=jnp.ones(N), problem=lambda s: s.laplacian), ("problem", "Stencil")),
+    ("evolve", "no absolute tolerance", lambda: evolve(atol=0.0), ("atol = 0", "above 0")),
+    ("evolve", "no step of Euler's", lambda: evolve(solver=dfx.Euler()), ("Euler", "dt0")),
     ("evolve", "an end before the start", lambda: evolve(t1=-1.0), ("t1", "-1", "0")),
     ("evolve", "an end that is text", lambda: evolve(t1="1"), ("t1", "'1'")),
     ("evolve", "saves out of order", lambda: evolve(saveat=[0.5, 0.2]), ("saveat", "0.5")),

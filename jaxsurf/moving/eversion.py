@@ -38,9 +38,10 @@ def _inside(surface: Discretization) -> float:
     cloud, lists = surface.cloud, surface.neighbors
     on = cloud.host_active
     points, n = np.asarray(cloud.points, float), np.asarray(cloud.normals, float)[on]
-    steps = points[np.asarray(lists.indices)] - points[:, None]
-    far = np.max(np.sum(steps**2, axis=2), axis=1, where=np.asarray(lists.mask), initial=0)[on]
-    share = far ** ((cloud.dim - 1) / 2)
+    far = np.zeros(len(points))
+    for j, listed in zip(np.asarray(lists.indices).T, np.asarray(lists.mask).T):
+        far = np.maximum(far, listed * np.sum((points[j] - points) ** 2, axis=1))
+    share = far[on] ** ((cloud.dim - 1) / 2)
     x = points[on] - np.average(points[on], axis=0, weights=share)
     if np.linalg.norm(share @ n) > _CLOSED * share.sum():
         return 0.0

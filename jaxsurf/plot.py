@@ -208,7 +208,8 @@ class Scene(NamedTuple):
             raise ValueError("nothing to draw: no point is switched on")
         if cloud.dim == 2:
             return Scene(points, normals, None)
-        raster = rasterize(points, normals, camera=camera_of(view, up), pixels=pixels)
+        closed, camera = cloud.boundary is None, camera_of(view, up)
+        raster = rasterize(points, normals, closed=closed, camera=camera, pixels=pixels)
         return Scene(points, normals, raster)
 
 

@@ -17,6 +17,8 @@ _DISK = 1.35
 _COVER = 0.6
 # Sine of how far over the horizon points still support the outline of the side that is seen.
 _RIM = 0.5
+# Square of the part of a disk that is surely on the surface, in units of its radius.
+_CORE = 0.36
 # Rendered finer than shown and averaged, for smooth outlines.
 _FINER = 2
 
@@ -69,7 +71,7 @@ def camera_of(view, up) -> np.ndarray:
     return np.stack([right, np.cross(toward, right), toward])
 
 
-def rasterize(points, normals, *, camera, pixels: int) -> Raster:
+def rasterize(points, normals, *, closed: bool, camera, pixels: int) -> Raster:
     x, normal = points @ camera.T, normals @ camera.T
     radius = _DISK * _spacing(points)
     margin = np.median(radius)
@@ -79,6 +81,8 @@ def rasterize(points, normals, *, camera, pixels: int) -> Raster:
     size = rows * columns
     radius = np.maximum(radius, 1.5 * step)
     pairs = _covered(x, normal, radius, low, step, (columns, rows))
+    if closed:
+        pairs = _before_backs(*pairs, side=normal[:, 2], size=size)
     pixel, point, share = _front(*pairs, side=normal[:, 2], radius=radius, size=size)
     sums = [np.bincount(pixel, share * c[point], minlength=size) for c in normal.T]
     mean = np.stack(sums, axis=1).astype(np.float32)
@@ -92,6 +96,17 @@ def rasterize(points, normals, *, camera, pixels: int) -> Raster:
     return Raster(pixel, point, share, shown, covered, behind.reshape(shape), extent)
 
 
+def _before_backs(pixel, point, far, depth, *, side, size: int):
+    """Without what shows its back where anything faces the viewer: that hides it, if it is closed.
+
+    Elsewhere an open surface is seen from inside, whose border nobody marked.
+    """
+    faced = np.zeros(size, bool)
+    faced[pixel[(far < _CORE) & (side[point] >= 0)]] = True
+    kept = (side[point] > -_RIM) | ~faced[pixel]
+    return pixel[kept], point[kept], far[kept], depth[kept]
+
+
 def _front(pixel, point, far, depth, *, side, radius, size: int):
     """The pairs on the foremost sheet of every pixel, with shares that add up to one there.
 
@@ -102,7 +117,7 @@ def _front(pixel, point, far, depth, *, side, radius, size: int):
     found = []
     for _ in range(4):
         foremost = np.full(2 * size, -np.inf, np.float32)
-        core = far < 0.36
+        core = far < _CORE
         place = pixel[core] + size * (side[point[core]] < 0)
         np.maximum.at(foremost, place, depth[core])
         front = foremost.reshape(2, size)

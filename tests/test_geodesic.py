@@ -233,6 +233,8 @@ def test_misuse():
         js.geodesic_distance(cloud, jnp.zeros(7, bool))
     with pytest.raises(ValueError, match="sources must be concrete"):
         jax.jit(lambda s: js.geodesic_distance(cloud, s))(jnp.array([0]))
+    with pytest.raises(ValueError, match=r"make them with np\.array"):
+        jax.jit(lambda: js.geodesic_distance(cloud, jnp.array([0])))()
     apart = cloud.points + jnp.array([10.0, 0, 0])
     both = js.PointCloud(
         jnp.concatenate([cloud.points, apart]), jnp.concatenate([cloud.normals] * 2)

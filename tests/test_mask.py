@@ -270,6 +270,36 @@ def test_the_mask_may_be_traced():
     assert len(traced) == 1
 
 
+def test_a_hierarchy_made_in_compiled_code_has_the_identity_where_points_are_off():
+    """Also of few unknowns: gradients in solutions reach rows that are off, solutions do not."""
+    c = masked(1, N)
+    screened = 1 - 0.1 * js.discretize(c.cloud, c.neighbors, method=METHOD).laplacian
+    hierarchy = js.multigrid(screened, renewable=True, mean_zero=False)
+    residual = jnp.asarray(np.random.default_rng(0).normal(size=ALL))
+    want, have = hierarchy(residual), hierarchy.renewed(screened)(residual)
+    size = float(jnp.abs(want).max())
+    np.testing.assert_allclose(have, want, rtol=0, atol=1e-5 * size)  # in single precision
+
+
+def test_gradients_of_compiled_solutions_reach_no_row_that_is_off():
+    c = masked(1, N)
+    surface = js.discretize(c.cloud, c.neighbors, method=METHOD)
+    alone = js.PointCloud(c.x, c.x)
+    part = js.discretize(alone, js.find_neighbors(alone, c.neighbors.k), method=METHOD)
+
+    def gradient(surface, u):
+        def total(points):  # of all rows alike
+            screened = 1 - 0.1 * surface.moved(points).laplacian
+            return jnp.sum(js.solve(screened, u, mean_zero=False, rtol=1e-11).value)
+
+        return jax.jit(jax.grad(total))(surface.cloud.points)
+
+    have, want = gradient(surface, c.u), gradient(part, smooth(c.x))
+    size = float(jnp.abs(want).max())
+    np.testing.assert_allclose(have[c.rows], want, rtol=0, atol=SOLVED * size)
+    assert not np.delete(have, c.rows, axis=0).any()
+
+
 @pytest.mark.slow
 def test_multigrid_with_levels():
     """Of more unknowns than are solved for at once."""

@@ -19,7 +19,9 @@ from ..failures import is_concrete, needs_values, raise_at
 def source_indices(sources, cloud: PointCloud) -> Int[np.ndarray, " m"]:
     """Sources given as a mask or as indices, as sorted indices; else an error."""
     n = cloud.n
-    needs_values("sources", sources)
+    # Arrays that jnp makes in compiled code are traced, constants too.
+    instead = "under jit, vmap and grad make them with np.array, not with jnp.array"
+    needs_values("sources", sources, instead=instead)
     sources = np.asarray(sources)
     if sources.dtype == bool:
         if sources.shape != (n,):

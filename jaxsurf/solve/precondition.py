@@ -392,5 +392,7 @@ def _renewed(plan, operator, closure, mean_zero: bool, dtype) -> VCycle:
         )
         for v in found
     )
-    coarsest = aggregation.dense_inverse(dense, constant > 0, constant if mean_zero else None)
+    # Rows beyond the last aggregate are zero; those of points that are not free have the identity.
+    used = jnp.any(dense != 0, axis=1)
+    coarsest = aggregation.dense_inverse(dense, used, constant if mean_zero else None)
     return VCycle(mean_zero, renewal.narrowed(levels, dtype), coarsest.astype(dtype))

@@ -217,6 +217,8 @@ def instance(value: Any, kinds: type | tuple[type, ...], name: str, hint: str = 
     if not isinstance(value, kinds):
         kinds = kinds if isinstance(kinds, tuple) else (kinds,)
         needed = " or ".join(kind.__name__.removeprefix("Abstract") for kind in kinds)
+        if isinstance(getattr(value, "cloud", None), kinds):  # a surface in place of its points
+            hint = "its .cloud is one"
         more = f": {hint}" if hint else ""
         article = "an" if needed[0] in "AEIO" else "a"
         raise TypeError(f"{name} is {_short(value)}, expected {article} {needed}{more}")
@@ -293,6 +295,7 @@ def differentiable(f: Any, name: str, *arguments: jax.ShapeDtypeStruct) -> Any:
 
     Raises:
         TypeError: no function, or one that turns its arguments into NumPy arrays or numbers.
+        Exception: the function's own, with a note that says what it was called with.
     """
     if not callable(f):
         raise TypeError(f"{name} is {_short(f)}, expected a function")
@@ -304,6 +307,10 @@ def differentiable(f: Any, name: str, *arguments: jax.ShapeDtypeStruct) -> Any:
             f"{name} cannot be traced by JAX; write it with jax.numpy in place of NumPy, math and"
             f" conditions on values ({what})"
         ) from None
+    except Exception as error:
+        shapes = ", ".join(str(x.shape) for x in jax.tree.leaves(arguments))
+        error.add_note(f"{name} was called with {shapes}: arrays of these shapes are what it gets")
+        raise
 
 
 def _fits(given: tuple, wanted: tuple) -> bool:

@@ -231,7 +231,8 @@ def write(
 ) -> None:
     """File with the points, normals and fields, for ParaView and for `read`.
 
-    VTU and VTK hold scalars `(n,)`, vectors `(n, c)` and tensors `(n, d, d)`; PLY holds scalars,
+    VTU and VTK hold scalars `(n,)`, vectors `(n, c)` (VTK none with c = 2) and tensors
+    `(n, d, d)`; PLY holds scalars,
     and vectors as one scalar per component (`name_0`, `name_1`, …); XYZ holds points and normals
     only, of the points that are switched on. Plane curves are put at z = 0, their vectors and
     tensors filled with zeros. Boundary, activity and spacing go along where the cloud has them,

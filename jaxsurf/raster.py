@@ -17,8 +17,6 @@ _DISK = 1.35
 _COVER = 0.6
 # Sine of how far over the horizon points still support the outline of the side that is seen.
 _RIM = 0.5
-# Square of the part of a disk that is surely on the surface, in units of its radius.
-_CORE = 0.36
 # Rendered finer than shown and averaged, for smooth outlines.
 _FINER = 2
 
@@ -101,8 +99,8 @@ def _before_backs(pixel, point, far, depth, *, side, size: int):
 
     Elsewhere an open surface is seen from inside, whose border nobody marked.
     """
-    faced = np.zeros(size, bool)
-    faced[pixel[(far < _CORE) & (side[point] >= 0)]] = True
+    weight = np.where(side[point] > -_RIM, (1 - far) ** 2, 0)
+    faced = np.bincount(pixel, weight, minlength=size) > _COVER / 2
     kept = (side[point] > -_RIM) | ~faced[pixel]
     return pixel[kept], point[kept], far[kept], depth[kept]
 
@@ -117,7 +115,7 @@ def _front(pixel, point, far, depth, *, side, radius, size: int):
     found = []
     for _ in range(4):
         foremost = np.full(2 * size, -np.inf, np.float32)
-        core = far < _CORE
+        core = far < 0.36
         place = pixel[core] + size * (side[point[core]] < 0)
         np.maximum.at(foremost, place, depth[core])
         front = foremost.reshape(2, size)

@@ -107,6 +107,20 @@ def test_neighbors_of_another_cloud():
         js.laplace_beltrami(js.sphere(200), js.find_neighbors(SPHERE, k=30))
 
 
+def test_a_surface_in_place_of_its_cloud():
+    surface = js.discretize(SPHERE)
+    for function in (js.laplace_beltrami, js.mean_curvature, js.sort_cloud, js.discretize):
+        with pytest.raises(TypeError, match=r"Discretization, expected .*: its \.cloud is one"):
+            function(surface)
+
+
+def test_functions_of_one_point_that_are_written_for_many():
+    box = ((-2.0,) * 3, (2.0,) * 3)
+    with pytest.raises(ValueError) as caught:
+        js.level_set(lambda x: jnp.sum(x**2, axis=1) - 1, n=100, bounds=box)
+    assert any("phi was called with (3,)" in note for note in caught.value.__notes__)
+
+
 def test_settings_that_make_no_sense():
     with pytest.raises(ValueError, match="DCPSE: order = 0"):
         js.DCPSE(order=0)

@@ -1,10 +1,12 @@
 """Every public name has an example, and every example runs."""
 
+import builtins
 import doctest
 import importlib
 import inspect
 import pkgutil
 import re
+import symtable
 
 import diffrax as dfx
 import jax
@@ -34,6 +36,27 @@ def test_every_public_name_has_an_example():
     assert len(public) > 80
     without = [name for name, value in public.items() if ">>> " not in (value.__doc__ or "")]
     assert not without
+
+
+@pytest.mark.core
+def test_examples_can_be_copied():
+    """They name nothing but what a script has that begins as they do."""
+    known = {*vars(builtins), "js", "jax", "jnp", "np", "optax"}
+    unknown = {}
+    for name, value in vars(js).items():
+        if not name.startswith("_") and not inspect.ismodule(value):
+            examples = doctest.DocTestParser().get_examples(inspect.getdoc(value))
+            code = "".join(example.source for example in examples)
+            if missing := global_names(symtable.symtable(code, name, "exec")) - known:
+                unknown[name] = missing
+    assert not unknown
+
+
+def global_names(table: symtable.SymbolTable) -> set[str]:
+    """Names that a program reads and does not make."""
+    made = {symbol.get_name() for symbol in table.get_symbols() if symbol.is_local()}
+    read = {symbol.get_name() for symbol in table.get_symbols() if symbol.is_global()}
+    return read.union(*map(global_names, table.get_children())) - made
 
 
 # What has no error of its own: choices, conditions, files, pictures, exact points.

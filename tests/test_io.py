@@ -283,6 +283,13 @@ def test_cloud_and_fields_come_back(tmp_path, suffix):
         assert set(found) == set(fields)
 
 
+def test_a_series_is_read_by_its_files(tmp_path):
+    ball = ellipsoid(50)
+    write(tmp_path / "run.pvd", ball, times=[0.0, 1.0])
+    with pytest.raises(ValueError, match=r"'\.pvd'.*read the \.vtu files in .*run$"):
+        read(tmp_path / "run.pvd")
+
+
 def test_paraview_gets_a_vertex_for_every_point(tmp_path):
     path = tmp_path / "cloud.vtu"
     write(path, ellipsoid(50), {"v": jnp.ones((50, 3), jnp.float32)})

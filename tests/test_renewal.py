@@ -236,3 +236,19 @@ def test_what_cannot_be_renewed_is_told():
     made = js.step_preconditioner(js.BiharmonicDiffusion(laplacian), Z)
     with pytest.raises(ValueError, match="renewable=True"):
         made.renewed(js.BiharmonicDiffusion(laplacian))
+
+
+@pytest.mark.core
+def test_sums_with_compositions_take_a_preconditioner_from_outside():
+    stiff = lambda surface: 1 + 1e-2 * surface.laplacian @ surface.laplacian
+    cycle = js.multigrid(stiff(SURFACE))
+
+    def energy(points, preconditioner=None):
+        given = dict(mean_zero=False, preconditioner=preconditioner, rtol=1e-10)
+        return F @ js.solve(stiff(SURFACE.moved(points)), F, **given).value
+
+    points = SURFACE.cloud.points
+    with pytest.raises(ValueError, match=r"make js\.multigrid\(operator\) outside"):
+        jax.jit(energy)(points)
+    compiled = jax.jit(lambda points: energy(points, cycle))
+    assert js.taylor_remainders(compiled, points, 0.1 * points[:, ::-1]).slope > 1.9

@@ -34,7 +34,8 @@ def contents_of(path: str | Path, columns: str | None = None) -> Contents:
         reader = partial(xyz, columns=columns)
     if reader is None:
         known = ", ".join(_READERS)
-        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; known are {known}")
+        more = f": read the .vtu files in {path.with_suffix('')}" if path.suffix == ".pvd" else ""
+        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; known are {known}{more}")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     if path.stat().st_size == 0:

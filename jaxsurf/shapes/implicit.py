@@ -58,7 +58,7 @@ def project_to_level_set(
     Example:
         >>> def height(radius):
         ...     points = jnp.array([[0.6, 0.0, 0.8]])
-        ...     return project_to_level_set(lambda x: x @ x - radius**2, points)[0, 2]
+        ...     return js.project_to_level_set(lambda x: x @ x - radius**2, points)[0, 2]
         >>> bool(jnp.isclose(jax.grad(height)(1.0), 0.8))
         True
     """
@@ -120,7 +120,7 @@ def level_set_normals(phi: LevelSet, points: Float[Array, "n d"]) -> Float[Array
         ValueError: the gradient vanishes or is not finite, named by point, on concrete arrays.
 
     Example:
-        >>> level_set_normals(lambda x: x @ x - 1, jnp.array([[0.0, 2.0]])).tolist()
+        >>> js.level_set_normals(lambda x: x @ x - 1, jnp.array([[0.0, 2.0]])).tolist()
         [[0.0, 1.0]]
     """
     points = _checked_points(points)
@@ -153,7 +153,8 @@ def level_set_curvature(
         TypeError: phi is no function that JAX can trace.
 
     Example:
-        >>> mean, gauss = level_set_curvature(lambda x: x @ x - 4, jnp.array([[0.0, 0.0, 2.0]]))
+        >>> pole = jnp.array([[0.0, 0.0, 2.0]])
+        >>> mean, gauss = js.level_set_curvature(lambda x: x @ x - 4, pole)
         >>> float(mean[0]), float(gauss[0])
         (0.5, 0.25)
     """

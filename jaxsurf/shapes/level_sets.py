@@ -68,7 +68,7 @@ def level_set(
             gradient on it, or not exactly one of n and spacing.
 
     Example:
-        >>> cloud = level_set(lambda x: x @ x - 1, n=500, bounds=((-1.2,) * 3, (1.2,) * 3))
+        >>> cloud = js.level_set(lambda x: x @ x - 1, n=500, bounds=((-1.2,) * 3, (1.2,) * 3))
         >>> bool(jnp.abs(cloud.normals - cloud.points).max() < 1e-12)
         True
     """
@@ -166,10 +166,11 @@ def double_torus(thickness: float | Float[Array, ""] = 0.4) -> tuple[LevelSet, B
         ValueError: thickness outside that range, where concrete.
 
     Example:
-        >>> phi, bounds = double_torus(0.4)
-        >>> cloud = level_set(phi, n=1_000, bounds=bounds)
+        >>> phi, bounds = js.double_torus(0.4)
+        >>> cloud = js.level_set(phi, n=1_000, bounds=bounds)
         >>> def width(thickness):
-        ...     return js.project_to_level_set(double_torus(thickness)[0], cloud.points)[:, 0].max()
+        ...     phi, _ = js.double_torus(thickness)
+        ...     return js.project_to_level_set(phi, cloud.points)[:, 0].max()
         >>> bool(0.9 < jax.grad(width)(0.4) < 1.1)
         True
     """

@@ -183,7 +183,7 @@ def jitter(
     Args:
         cloud: n points.
         project: puts points on the surface; returns points and unit normals.
-        spacing: h, see `ideal_spacing`.
+        spacing: h, as a rule (area / n)^(1/2), of curves length / n.
         fraction: radius of the ball in units of the spacing.
         seed: of the random moves.
 
@@ -198,8 +198,11 @@ def jitter(
 
     Example:
         >>> cloud = js.sphere(1_000)
-        >>> h = ideal_spacing(4 * np.pi, 1_000)
-        >>> moved = jitter(cloud, js.shapes.analytic.sphere_projection(), spacing=h)
+        >>> h = (4 * jnp.pi / 1_000) ** 0.5
+        >>> def project(points):
+        ...     normals = points / jnp.linalg.norm(points, axis=1, keepdims=True)
+        ...     return normals, normals
+        >>> moved = js.jitter(cloud, project, spacing=h)
         >>> bool(jnp.linalg.norm(moved.points - cloud.points, axis=1).max() <= 0.26 * h)
         True
     """

@@ -41,7 +41,7 @@ def poisson_disk(
 
     Example:
         >>> points = np.random.default_rng(0).random((500, 2))
-        >>> kept = points[poisson_disk(points, 0.1)]
+        >>> kept = points[js.poisson_disk(points, 0.1)]
         >>> gaps = np.linalg.norm(kept[:, None] - kept[None], axis=-1) + np.eye(len(kept))
         >>> bool(gaps.min() >= 0.1)
         True

@@ -277,7 +277,7 @@ def multigrid(
     for one operator serves nearby ones too (other weights on the same neighbours), at the
     price of more steps, or is renewed. Under `jit` and `vmap`, where the neighbours are known and
     the weights are not, as on `surface.moved(points)`, aggregates are found by the neighbours and
-    the numbers computed in compiled code.
+    the numbers computed in compiled code (not of sums with compositions, as `1 + L @ L`).
 
     Args:
         operator: scalar, with concrete neighbours. For an indefinite Helmholtz operator

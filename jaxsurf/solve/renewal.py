@@ -226,7 +226,13 @@ def free_divisor(operator, matrix, restriction):
 
     Of the diagonal of A: E has none of free points.
     """
-    diagonal = operator.diagonal
+    try:
+        diagonal = operator.diagonal
+    except ValueError as error:
+        raise ValueError(
+            f"{error}. In compiled code multigrid needs it: make js.multigrid(operator) outside, "
+            "of this operator or one near it, and pass it as `preconditioner`"
+        ) from None
     free = restriction(jnp.ones_like(diagonal))
     below = stretched(diagonal, moduli(matrix)(free) / 2)
     return jnp.where(free > 0, below, 0), free

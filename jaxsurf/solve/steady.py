@@ -66,7 +66,8 @@ def solve(
         preconditioner: `js.multigrid(operator, closure=closure)` if None, also under
             `grad`, and with `mean_zero` under `jit` and `vmap` where the neighbours are concrete.
             Where these are traced, make it outside and pass it, `renewed` inside where the
-            operator is another. Or `js.jacobi(operator)`.
+            operator is another. Or `js.jacobi(operator)`. Of sums with compositions, as
+            `1 + L @ L`, it is made outside `jit` and `vmap` too, and not renewed.
         solver: a solver of lineax; `js.BiCGStab(rtol, atol, max_steps)` if None.
         mean_zero: whether A annihilates the constants; seen from the preconditioner or a
             concrete operator if None.

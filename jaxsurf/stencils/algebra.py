@@ -98,7 +98,7 @@ class AbstractOperator(eqx.Module):
             ValueError: an operator of which it is not known.
         """
         raise ValueError(
-            f"the diagonal of a {type(self).__name__} is not at hand: an operator of one's own "
+            f"the diagonal of a {type(self).__name__} is not at hand; an operator of one's own "
             "has it as its property diagonal"
         )
 

@@ -99,8 +99,8 @@ def _before_backs(pixel, point, far, depth, *, side, size: int):
 
     Elsewhere an open surface is seen from inside, whose border nobody marked.
     """
-    weight = np.where(side[point] > -_RIM, (1 - far) ** 2, 0)
-    faced = np.bincount(pixel, weight, minlength=size) > _COVER / 2
+    weight = np.where(side[point] >= 0, (1 - far) ** 2, 0)
+    faced = np.bincount(pixel, weight, minlength=size) > _COVER
     kept = (side[point] > -_RIM) | ~faced[pixel]
     return pixel[kept], point[kept], far[kept], depth[kept]
 

@@ -5,6 +5,7 @@ import matplotlib
 import numpy as np
 import PIL.Image
 import pytest
+from scipy import ndimage
 
 from jaxsurf import plot
 from jaxsurf.cloud import PointCloud
@@ -66,6 +67,10 @@ def test_an_open_surface_is_seen_from_inside():
     assert (covered[h // 4 : -h // 4, w // 4 : -w // 4] == 1).all()
     assert image[h // 2, w // 8, 2] > image[h // 2, w // 8, 0] + 0.1
     assert image[h // 2, -w // 8, 0] > image[h // 2, -w // 8, 2] + 0.1
+    # Its near side hides some of the inside, and nothing shows between them.
+    aslant, _ = picture(plot_cloud(cloud, view=(0.3, -0.5, 1), pixels=200))
+    gaps = ndimage.binary_fill_holes(aslant[..., 3] > 0) & (aslant[..., 3] == 0)
+    assert not gaps.any()
 
 
 def test_light_comes_from_the_upper_left():

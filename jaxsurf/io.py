@@ -232,11 +232,11 @@ def write(
     """File with the points, normals and fields, for ParaView and for `read`.
 
     VTU and VTK hold scalars `(n,)`, vectors `(n, c)` (VTK none with c = 2) and tensors
-    `(n, d, d)`; PLY holds scalars,
-    and vectors as one scalar per component (`name_0`, `name_1`, …); XYZ holds points and normals
-    only, of the points that are switched on. Plane curves are put at z = 0, their vectors and
-    tensors filled with zeros. Boundary, activity and spacing go along where the cloud has them,
-    except to XYZ. (In ParaView, choose *Point Gaussian* to see the points as a surface.)
+    `(n, d, d)`; PLY holds scalars, and vectors as one scalar per component (`name_0`, `name_1`,
+    …); XYZ holds points and normals only, of the points that are switched on. Plane curves are put
+    at z = 0, their vectors and tensors filled with zeros. Boundary, activity and spacing go along
+    where the cloud has them, except to XYZ. (In ParaView, choose *Point Gaussian* to see the points
+    as a surface.)
 
     With `times` it is a series: `run.pvd`, which ParaView opens as an animation, lists a VTU file
     for each time in the folder `run`. Of an evolution with one field:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..discretization import Discretization
 from ..failures import warn
+from ..interpolation import distance_and_reach
 
 # Of the volume over that of all cones from the middle, one on spheres: less, of thin bodies, is not
 # told by weights as rough as these.
@@ -35,14 +36,11 @@ def tell_eversion(start: Discretization, t0, ts, surfaces: Sequence[Discretizati
 
 def _inside(surface: Discretization) -> float:
     """About the volume inside, in units of the cones from the middle; 0 if it is not closed."""
-    cloud, lists = surface.cloud, surface.neighbors
-    on = cloud.host_active
-    points, n = np.asarray(cloud.points, float), np.asarray(cloud.normals, float)[on]
-    far = np.zeros(len(points))
-    for j, listed in zip(np.asarray(lists.indices).T, np.asarray(lists.mask).T):
-        far = np.maximum(far, listed * np.sum((points[j] - points) ** 2, axis=1))
-    share = far[on] ** ((cloud.dim - 1) / 2)
-    x = points[on] - np.average(points[on], axis=0, weights=share)
+    cloud, on = surface.cloud, surface.cloud.host_active
+    x, n = (np.asarray(a, float)[on] for a in (cloud.points, cloud.normals))
+    _, reach = distance_and_reach(cloud, surface.neighbors, cloud.points, np.arange(cloud.n))
+    share = np.asarray(reach, float)[on] ** (cloud.dim - 1)
+    x -= np.average(x, axis=0, weights=share)
     if np.linalg.norm(share @ n) > _CLOSED * share.sum():
         return 0.0
     return float(share @ np.sum(x * n, axis=1) / (share @ np.linalg.norm(x, axis=1)))

@@ -248,6 +248,7 @@ def run(
         end = until or _rounded(surface.size**2 / 100)
         heat = Heat.within(end, at_rest, float(spectrum.radius))
         probe = _probe(cloud, source, float(np.sqrt(2 * heat.until)))
+        reading = _reading(cloud, areas, probe, surface.size / 16)
         # One program for heat, gradient and difference: another takes longer to compile than it
         # saves.
         value = jnp.asarray(surface.parameter[1], start.dtype)
@@ -260,7 +261,7 @@ def run(
             method,
             closure,
             heat,
-            jnp.asarray(probe),
+            reading,
         )
         try:
             (_, temperature), (gradient, sensitivity) = at(value)
@@ -330,14 +331,14 @@ def save(demo: Demo, out: Path) -> list[Path]:
     return files
 
 
-def _temperature_at(value, start, surface, areas, neighbors, method, closure, heat, probe):
-    """Final temperature at the probe for a value of the surface's parameter; and all others."""
+def _temperature_at(value, start, surface, areas, neighbors, method, closure, heat, reading):
+    """What the probe reads in the end for a value of the surface's parameter; and temperatures."""
     cloud, moved = surface
     at = moved(value)
     laplacian = laplace_beltrami(at, neighbors, method=method)
     kept = carried(areas, cloud, at, neighbors) if closure is None else None
     temperature = diffuse(laplacian, closure, start, heat, kept)
-    return temperature[-1, probe], temperature
+    return temperature[-1] @ reading, temperature
 
 
 # Everything large is an argument: arrays that a compiled function closes over are folded.
@@ -379,6 +380,16 @@ def _probe(cloud: PointCloud, source: int, distance: float) -> int:
     if cloud.boundary is not None:
         off = np.where(np.asarray(cloud.boundary), np.inf, off)
     return int(np.argmin(np.where(normals @ normals[source] > 0, off, np.inf)))
+
+
+def _reading(cloud, areas, probe: int, width: float) -> Float[Array, " n"]:
+    """Weights of a mean about a point, on its side of the surface.
+
+    The steps damp what is rough only little: read at one point, the sensitivity has rings about it.
+    """
+    facing = cloud.normals @ cloud.normals[probe] > 0
+    weights = jnp.where(facing, areas * spot(cloud, probe, width), 0)
+    return weights / jnp.sum(weights)
 
 
 def _change(content: Float[Array, " frames"]) -> float:

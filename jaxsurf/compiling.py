@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 
 from .arguments import is_array
 from .failures import is_concrete
-from .machine import PIECE, QUICK, machine
+from .machine import CPU, PIECE, QUICK, machine
 
 if TYPE_CHECKING:
     AnyArray = Any  # the kind that goes in comes out
@@ -187,6 +188,29 @@ def block_by_block(function: Callable, dtype, *, rows: int = 4_096) -> Callable:
         return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(points)], *blocks)
 
     return call
+
+
+# The name of what reverse mode stores, block by block: short, and long to compute.
+KEPT = "kept"
+
+
+def kept(a: AnyArray) -> AnyArray:
+    """An array that has this name; the others are found again from what a block is given."""
+    return checkpoint_name(a, KEPT) if isinstance(a, jax.Array) else a
+
+
+def stored(a: jax.Array, never) -> jax.Array:
+    """The same array, which is stored then, and so is its cotangent.
+
+    The compiler finds cheap values again for every use of them. It looks through barriers on a CPU,
+    but takes nothing out of a branch.
+
+    Args:
+        never: False, which the compiler cannot know.
+    """
+    if machine() is not CPU:
+        return jax.lax.optimization_barrier(a)
+    return jax.lax.cond(never, jnp.zeros_like, lambda a: a, a)
 
 
 def power_of_two(count: int) -> int:

@@ -16,9 +16,61 @@ from jaxsurf.fits.moments import (
     polynomial_fit,
 )
 from jaxsurf.fits.monomials import differentiation, monomials, multi_indices
+from jaxsurf.fits.sums import spread, sums
 from jaxsurf.stencils.targets import Gradient, Hessian, Laplacian, Partial
 
 from .helpers import check_derivative
+
+
+def _plain_sums(rows, axis):
+    return [jnp.sum(row, axis=axis) for row in rows]
+
+
+def _plain_spread(rows, axis, size):
+    return [jnp.repeat(jnp.expand_dims(row, axis), size, axis) for row in rows]
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize(
+    "ours, plain, shape, rest",
+    [(sums, _plain_sums, (2, 40, 3), (1,)), (spread, _plain_spread, (2, 3), (1, 40))],
+)
+def test_many_sums_in_one_pass(ours, plain, shape, rest, compiled):
+    """Values, both modes of derivatives, second ones, and batches with rows that all share."""
+    rng = np.random.default_rng(0)
+    a, b, d = (jnp.asarray(rng.normal(size=shape)) for _ in range(3))
+
+    def both(f):
+        def value(a, b):
+            # Nothing of the second row counts: it has no cotangent.
+            first, _, third = f([a * b, a, jnp.sin(a)], *rest)
+            return jnp.sum(first**2 * third)
+
+        tangent = lambda a, b: jax.jvp(value, (a, b), (d, d))[1]
+        found = (value, jax.grad(value, (0, 1)), tangent, jax.grad(tangent))
+        batches = jax.vmap(jax.grad(value), (2, None)), jax.vmap(jax.grad(value), (None, 0))
+        args = (jnp.stack([a, b], axis=2), b), (a, jnp.stack([a, b]))
+        run = jax.jit if compiled else lambda f: f
+        return [run(f)(a, b) for f in found] + [run(f)(*x) for f, x in zip(batches, args)]
+
+    for one, other in zip(jax.tree.leaves(both(ours)), jax.tree.leaves(both(plain)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="of the compiler for CPUs")
+@pytest.mark.parametrize("transposed", [False, True])
+def test_sums_are_one_reduction(transposed):
+    """Also as what is transposed to copies."""
+
+    def f(a):
+        if not transposed:
+            return sums([a, a**2, a**3], 0)
+        rows = jax.vjp(lambda *rows: spread(rows, 0, 40), a[0], a[1], a[2])[1]
+        return rows([a, a**2, a**3])
+
+    program = jax.jit(f).lower(jnp.ones((40, 5))).compile().as_text()
+    assert program.count(" reduce(") == 1
+    assert " reduce-window(" not in program
 
 
 @pytest.mark.parametrize("dim, high", [(1, 4), (2, 5), (3, 6)])

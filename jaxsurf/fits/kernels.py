@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..compiling import kept
+
 
 def taper(s: Float[Array, "*q"]) -> Float[Array, "*q"]:
     r"""Cut-off $(1 - s^4)^3$ for $s = r^2/\rho^2 < 1$, else 0: twice differentiable."""
@@ -103,7 +105,7 @@ def _log_radius(r2, mask, target):
 def _log_radius_jvp(primals, tangents):
     # The implicit function theorem; the target is a number of points.
     r2, mask, target = primals
-    t = _log_radius(r2, mask, target)
+    t = kept(_log_radius(r2, mask, target))
     _, slope = _counted(r2, mask, t)
     unit = jnp.exp(-2 * t)
     s = jnp.minimum(r2 * unit, 1)

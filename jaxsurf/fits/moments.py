@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
-from ..compiling import AnyArray, namespace
+from ..compiling import KEPT, AnyArray, namespace
 from . import systems
 from .monomials import (
     differentiation,
@@ -35,9 +35,8 @@ from .monomials import (
     polynomial_count,
     position,
 )
+from .sums import sums
 
-# The name of what is worth storing until derivatives need it: short, and long to compute.
-KEPT = "kept"
 # In single precision weights are corrected until moments are met to this, so many times at most.
 _SINGLE, _ROUNDS = 3e-5, 8
 
@@ -75,8 +74,8 @@ def _solve(x, w, b, low, high):
     v, start, gram, (solve, condition) = _system(x, w, low, high)
     small = isinstance(v, list)
     b = b.astype(w.dtype).reshape(*b.shape, *(1,) * (w.ndim + 1 - b.ndim))
-    wanted = list(b) if small else jnp.broadcast_to(b, (*b.shape[:2], *w.shape[1:]))
-    a = solve(wanted)
+    a = solve(b * jnp.ones_like(w[0]))
+    wanted, a = (systems.entries(b), systems.entries(a)) if small else (b, a)
     s = systems.combine(a, v[start:])
     size = jnp.max(jnp.abs(b), axis=(0, 1))
     size = jnp.where(size > 0, size, 1)
@@ -135,12 +134,12 @@ def _moment_solve_jvp(low, high, primals, tangents):
     dx, dw, db = tangents
     (eta, condition, residual), (v, start, solve, a, s) = _solve(x, w, b, low, high)
     dx = _columns(dx, v, w)
-    s = systems.stored(s, v, w)
-    g = systems.stored(dw * s + w * moved(a, v, dx, start, high), v, w)
+    s = systems.found_once(s, v, w)
+    g = dw * s + w * moved(a, v, dx, start, high)
     rhs = add_moved_moments(systems.moments(v[start:], g), eta, v, dx, start, high)
     if b.ndim > 2:
         rhs = systems.add(rhs, [-row for row in db] if isinstance(rhs, list) else -db)
-    d_eta = systems.stored(g - w * systems.combine(solve(rhs), v[start:]), v, w)
+    d_eta = systems.found_once(g - w * systems.combine(solve(rhs), v[start:]), v, w)
     return (eta, condition, residual), (d_eta, jnp.zeros_like(condition), jnp.zeros_like(residual))
 
 
@@ -178,7 +177,7 @@ def _fit(x, w, values, low, high):
     basis = v[start:]
     a = solve(systems.moments(basis, w * values), refined=False)
     # Refined by the residual: squaring the condition number costs digits, many in float32.
-    left = systems.stored(w * (values - systems.combine(a, basis)), v, w)
+    left = w * (values - systems.combine(a, basis))
     more = solve(systems.moments(basis, left), refined=False)
     if isinstance(a, list):
         a, more = jnp.stack(a), jnp.stack(more)
@@ -192,9 +191,9 @@ def _polynomial_fit_jvp(low, high, primals, tangents):
     dx, dw, dz = tangents
     (out, condition), (v, start, solve) = _fit(x, w, values, low, high)
     dx = _columns(dx, v, w)
-    a = list(out) if isinstance(v, list) else out
-    left = systems.stored(values - systems.combine(a, v[start:]), v, w)
-    g = systems.stored(dw * left + w * (dz - moved(a, v, dx, start, high)), v, w)
+    a = systems.entries(out) if isinstance(v, list) else out
+    left = values - systems.combine(a, v[start:])
+    g = dw * left + w * (dz - moved(a, v, dx, start, high))
     da = solve(add_moved_moments(systems.moments(v[start:], g), w * left, v, dx, start, high))
     da = jnp.stack(da) if isinstance(v, list) else da
     return (out, condition), (da, jnp.zeros_like(condition))
@@ -204,28 +203,46 @@ def _columns(dx, v, w):
     """Coordinates one by one: as slices each would have a derivative as large as all of them."""
     if not isinstance(v, list):
         return dx
-    return [systems.stored(part[0], v, w) for part in jax.lax.split(dx, (1,) * len(dx))]
+    return [systems.found_once(part[0], v, w) for part in jax.lax.split(dx, (1,) * len(dx))]
 
 
 def moved(a, v, dx, start, high):
     """dV a: the gradient of the polynomials with coefficients a, along dx."""
     matrices = _slopes(len(dx), start, high)
     v = v[: matrices.shape[1]]
-    return sum(systems.combine(systems.transform(d, a), v) * dx_i for d, dx_i in zip(matrices, dx))
+    if isinstance(v, list):
+        each = (systems.combine(systems.transform(d, a), v) for d in matrices)
+        return sum(slope * dx_i for slope, dx_i in zip(each, dx))
+    # One product for all coordinates: the monomials are read once.
+    slopes = jnp.tensordot(matrices.astype(a.dtype), a, 1).swapaxes(0, 1)
+    slopes = systems.combine(slopes.reshape(len(v), -1, *a.shape[2:]), v)
+    return jnp.sum(slopes.reshape(len(dx), -1, *dx.shape[1:]) * dx[:, None], axis=0)
 
 
 def add_moved_moments(rhs, eta, v, dx, start, high):
     """A right-hand side plus dV^T eta: the same matrices transposed."""
     matrices = _slopes(len(dx), start, high)
     v = v[: matrices.shape[1]]
-    for d, dx_i in zip(matrices, dx):
-        rhs = systems.add(rhs, systems.transform(d.T, systems.moments(v, eta * dx_i)))
-    return rhs
+    if isinstance(v, list):
+        for d, dx_i in zip(matrices, dx):
+            rhs = systems.add(rhs, systems.transform(d.T, systems.moments(v, eta * dx_i)))
+        return rhs
+    each = systems.moments(v, (eta * dx[:, None]).reshape(-1, *eta.shape[1:]))
+    each = each.reshape(len(v), len(dx), -1, *each.shape[2:])
+    return rhs + jnp.tensordot(matrices.astype(each.dtype), each, ((1, 0), (0, 1)))
 
 
 def _slopes(dim: int, start: int, high: int) -> np.ndarray:
     """Coefficients of derivatives, which are a degree lower, from those of the basis."""
     return differentiation(dim, high)[:, : polynomial_count(dim, high - 1), start:]
+
+
+@functools.cache
+def _table(dim: int, low: int, high: int) -> np.ndarray:
+    """Where the moment of multi-index beta + gamma stands."""
+    basis, place = multi_indices(dim, low, high), position(dim, 2 * high)
+    total = (basis[:, None] + basis).tolist()
+    return np.array([[place[tuple(g)] for g in row] for row in total], np.int32)
 
 
 @functools.cache
@@ -245,11 +262,8 @@ def _gather_table(dim: int, low: int, high: int) -> tuple[np.ndarray, np.ndarray
 def gram_matrix(x, w, low, high):
     """The matrix A, each moment summed once."""
     if _is_small(x, low, high):
-        sums = [jnp.sum(row, axis=0) for row in monomial_rows(x, 2 * high, w)]
-        # Slower than this was to gather from their stack.
-        basis, place = multi_indices(len(x), low, high), position(len(x), 2 * high)
-        total = (basis[:, None] + basis).tolist()
-        return jnp.stack([jnp.stack([sums[place[tuple(g)]] for g in row]) for row in total])
+        each = sums(monomial_rows(x, 2 * high, w), 0)
+        return jnp.stack(each)[_table(len(x), low, high)]
     # Moments as one small matrix product: monomials in all coordinates but the last, times
     # powers of the last.
     powers, xp = monomials(x[-1:], 2 * high), namespace(x)
@@ -290,15 +304,15 @@ def out_of_blocks(a: Shaped[Array, "blocks *s size"], n: int) -> Shaped[Array, "
 def blockwise(f: Callable, blocks, count=None):
     """`f` on one block after another: memory stays flat.
 
-    In reverse mode each block is computed again from its inputs and from what has the name `KEPT`
-    (`jax.ad_checkpoint.checkpoint_name`) instead of being stored.
+    In reverse mode each block is computed again from its inputs and from what is `kept`, instead of
+    being stored.
 
     Args:
         count: only so many of them, may be traced; not differentiable then. None: all.
     """
     if count is None:
-        kept = jax.checkpoint_policies.save_only_these_names(KEPT)
-        return jax.lax.map(jax.checkpoint(f, policy=kept), blocks)
+        named = jax.checkpoint_policies.save_only_these_names(KEPT)
+        return jax.lax.map(jax.checkpoint(f, policy=named), blocks)
     f = jax.jit(f)  # traced once
     at, put_at = jax.lax.dynamic_index_in_dim, jax.lax.dynamic_update_index_in_dim
     block = lambda i: jax.tree.map(lambda a: at(a, i, keepdims=False), blocks)

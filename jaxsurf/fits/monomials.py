@@ -73,9 +73,10 @@ def monomial_rows(
     x: Float[Array, "dim *q"], high: int, first: Float[Array, "*q"] | None = None
 ) -> list[Float[Array, "*q"]]:
     """The same one by one, all times a common factor `first` if given."""
+    coordinates = list(x)
     rows = [jnp.ones_like(x[0]) if first is None else first]
-    for lower, axis in _parents(x.shape[0], high):
-        rows.append(rows[lower] * x[axis])
+    for lower, axis in _parents(len(x), high):
+        rows.append(rows[lower] * coordinates[axis])
     return rows
 
 

@@ -12,16 +12,20 @@ Shapes: q points of a neighbourhood, c right-hand sides, m monomials, `*p` point
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..compiling import is_quick, namespace
-from ..machine import machine
+from ..compiling import is_quick, namespace, stored
+from ..machine import CPU, machine
+from .sums import spread, sums
 
 # Columns of a factor between two passes over the matrix.
 _TOGETHER = 8
+# Monomials of a sum.
+_SUMMED = 32
 
 
 def is_small(unknowns: int) -> bool:
@@ -29,18 +33,38 @@ def is_small(unknowns: int) -> bool:
     return unknowns <= machine().unknowns and not is_quick()
 
 
+def entries(a) -> list[jax.Array]:
+    """A vector over the basis as a list."""
+    return list(jnp.unstack(a))
+
+
 def combine(a, v):
     """Polynomials at the points, `(c, q, *p)`: the monomials v with coefficients a."""
     if isinstance(v, list):
-        return _total(a_i[:, None] * v_i for a_i, v_i in zip(a, v))
+        return _total(a_i * v_i for a_i, v_i in zip(spread(a, 1, len(v[0])), v))
+    if _in_passes(v):
+        return _total((a[some, :, None] * v[some, None]).sum(axis=0) for some in _parts(v))
     return namespace(v).einsum("mc...,mq...->cq...", a, v)
 
 
 def moments(v, eta):
     """Moments of the weights eta `(c, q, *p)`."""
     if isinstance(v, list):
-        return [jnp.sum(eta * v_i, axis=1) for v_i in v]
+        return sums([eta * v_i for v_i in v], 1)
+    if _in_passes(v):
+        return jnp.concatenate([(v[some, None] * eta).sum(axis=2) for some in _parts(v)])
     return namespace(v).einsum("mq...,cq...->mc...", v, eta)
+
+
+def _in_passes(v) -> bool:
+    """Whether sums over the basis run over the points of a block: a library would want those first,
+    and copies all monomials for that."""
+    return v.ndim > 2 and namespace(v) is jnp and machine() is CPU and not is_quick()
+
+
+def _parts(v) -> list[slice]:
+    """So few monomials that the compiler adds them up in one pass, which stores no products."""
+    return [slice(first, first + _SUMMED) for first in range(0, len(v), _SUMMED)]
 
 
 def symmetric(gram, a):
@@ -52,8 +76,9 @@ def symmetric(gram, a):
 def transform(matrix: np.ndarray, a):
     """A constant matrix times a vector over the basis."""
     if isinstance(a, list):
-        zero = jnp.zeros_like(a[0])
-        return [_total((f * a_i for f, a_i in zip(row, a) if f), zero) for row in matrix.tolist()]
+        zero, times = jnp.zeros_like(a[0]), lambda f, a_i: a_i if f == 1 else f * a_i
+        rows = matrix.tolist()
+        return [_total((times(f, a_i) for f, a_i in zip(row, a) if f), zero) for row in rows]
     return jnp.tensordot(matrix.astype(a.dtype), a, 1)
 
 
@@ -67,23 +92,20 @@ def subtract(a, b):
     return [x - y for x, y in zip(a, b)] if isinstance(a, list) else a - b
 
 
-def stored(x, v, w):
-    """The same array, which the compiler then stores, as it takes nothing out of a branch.
+def found_once(x, v, w):
+    """The same array, found once: else a compiler finds it again for each monomial of v, say.
 
-    Else it finds it again for every use: a sum for each monomial of v, say. It looks through
-    barriers, and does not know that no weight w is negative.
+    No weight w is negative.
     """
-    if not isinstance(v, list):
-        return x
-    return jax.lax.cond(~(w[0, 0] < 0), lambda x: x, jnp.zeros_like, x)
+    return stored(x, w[0, 0] < 0) if isinstance(v, list) else x
 
 
 def factor(gram):
-    """A solver for the equilibrated symmetric matrix, and its condition estimate.
+    r"""A solver for the equilibrated symmetric matrix, and its condition estimate.
 
-    The factorisation gets a shift of the size of round-off, so that it exists also where a
+    The factorisation gets a shift $\sigma$ of the size of round-off, so that it exists also where a
     moment is dependent on the others (a flat surface with few normal copies, say); one step of
-    refinement on the unshifted matrix takes the effect of the shift away again.
+    refinement, $(A + \sigma) x_1 = b + \sigma x_0$, takes its effect away again.
     """
     rsqrt = jax.lax.rsqrt if namespace(gram) is jnp else lambda x: 1 / np.sqrt(x)
     diagonal = _diagonal(gram)
@@ -96,7 +118,7 @@ def factor(gram):
         rows = isinstance(b, list)
         b = (jnp.stack(b) if rows else b) * scale[:, None]
         x = solve_scaled(b, refined) * scale[:, None]
-        return list(x) if rows else x
+        return entries(x) if rows else x
 
     xp = namespace(pivot)
     return solve, (xp.max(pivot, axis=0) / xp.min(pivot, axis=0)) ** 2
@@ -115,23 +137,23 @@ def _by_columns(a, shift):
 
     def substitute(b):
         def forward(i, y):
-            left = b[i] - jnp.sum(columns[:, i, None] * y, axis=0)
-            return y.at[i].set(left / pivot[i])
+            left = _at(b, i) - jnp.sum(_at(columns, i, 1)[:, None] * y, axis=0)
+            return _put(y, left / _at(pivot, i), i)
 
         def backward(j, x):
-            i = m - 1 - j
-            left = y[i] - jnp.sum(columns[i, :, None] * x, axis=0)
-            return x.at[i].set(left / pivot[i])
+            i = np.uint32(m - 1) - j
+            left = _at(y, i) - jnp.sum(_at(columns, i)[:, None] * x, axis=0)
+            return _put(x, left / _at(pivot, i), i)
 
-        y = jax.lax.fori_loop(0, m, forward, jnp.zeros_like(b))
-        return jax.lax.fori_loop(0, m, backward, jnp.zeros_like(b))
+        y = _loop(m, forward, jnp.zeros_like(b))
+        return _loop(m, backward, jnp.zeros_like(b))
 
     def times(x):
-        return symmetric(a, x)
+        rows = jnp.sum(columns[:, :, None] * x, axis=1)
+        return jnp.sum(columns[:, :, None] * rows[:, None], axis=0) - shift * x
 
     def solution(_, b):
-        refine = lambda _, x: x + substitute(b - times(x))
-        return jax.lax.fori_loop(0, 2, refine, jnp.zeros_like(b))
+        return jax.lax.fori_loop(0, 2, lambda _, x: substitute(b + shift * x), jnp.zeros_like(b))
 
     def solve(b, refined):
         if not refined:
@@ -151,7 +173,7 @@ def _cholesky(a, shift):
     for start in range(0, m, _TOGETHER):
         few = _eliminated(a[:_TOGETHER], shift)
         count = len(few)
-        columns = columns.at[start : start + count, start:].set(few)
+        columns = jax.lax.dynamic_update_slice(columns, few, (start, start, *(0,) * (a.ndim - 2)))
         if start + count < m:
             below, left = few[:, count:], a[count:, count:]
             left = functools.reduce(lambda a, c: a - c[:, None] * c, below, left)
@@ -162,16 +184,29 @@ def _cholesky(a, shift):
 def _eliminated(rows, shift):
     """The first columns of a factor, of as many rows of a symmetric matrix."""
     count, m = rows.shape[:2]
-    places = jnp.arange(m).reshape(m, *(1,) * (rows.ndim - 2))
+    places = np.arange(m, dtype=np.uint32).reshape(m, *(1,) * (rows.ndim - 2))
 
     def eliminate(j, columns):
         # Columns that are not there yet are zero.
-        column = rows[j] - jnp.sum(columns * columns[:, j, None], axis=0)
+        column = _at(rows, j) - jnp.sum(columns * _at(columns, j, 1)[:, None], axis=0)
         column = jnp.where(places == j, column + shift, column)
-        column = jnp.where(places < j, 0, column * jax.lax.rsqrt(column[j]))
-        return columns.at[j].set(column)
+        column = jnp.where(places < j, 0, column * jax.lax.rsqrt(_at(column, j)))
+        return _put(columns, column, j)
 
-    return jax.lax.fori_loop(0, count, eliminate, jnp.zeros_like(rows))
+    return _loop(count, eliminate, jnp.zeros_like(rows))
+
+
+def _loop(count: int, body: Callable, start):
+    """`fori_loop` over numbers without a sign, which need no code for negative ones."""
+    return jax.lax.fori_loop(np.uint32(0), np.uint32(count), body, start)
+
+
+def _at(a, i, axis: int = 0):
+    return jax.lax.dynamic_index_in_dim(a, i, axis, keepdims=False)
+
+
+def _put(a, row, i):
+    return jax.lax.dynamic_update_index_in_dim(a, row, i, 0)
 
 
 def _by_lapack(a, shift):
@@ -188,7 +223,7 @@ def _by_lapack(a, shift):
         b = xp.moveaxis(b, (0, 1), (-2, -1))
         x = substitute(b)
         if refined:
-            x = x + substitute(b - a @ x)
+            x = substitute(b + shift * x)
         return xp.moveaxis(x, (-2, -1), (0, 1))
 
     return solve, xp.moveaxis(xp.diagonal(chol, axis1=-2, axis2=-1), -1, 0)

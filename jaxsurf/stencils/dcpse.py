@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..compiling import stored
 from ..fits.kernels import gaussian, taper
 from ..fits.lines import line_solve
 from ..fits.moments import moment_solve
@@ -99,8 +100,8 @@ class DCPSE(AbstractMethod):
         low, high = _degrees(target.order, self.order)
         w = fade * gaussian(jnp.sum(copies**2, axis=0), width, radius)
         b = jnp.asarray(target.moments(dim, low, high), w.dtype)
-        lines = jax.lax.optimization_barrier((copies / width, w))
-        eta, condition, residual = line_solve(*lines, b, low, high)
+        x, w = (stored(a, jnp.any(width < 0)) for a in (copies / width, w))
+        eta, condition, residual = line_solve(x, w, b, low, high)
         diagnostics = Diagnostics.of(neighborhood, condition, residual, radius, count)
         eta = eta / width**target.order
         return target.assemble(_with_center(eta, target), frame), diagnostics

@@ -27,7 +27,7 @@ def take(values: Float[AnyArray, "m *c"], j: Int[AnyArray, "..."]) -> Float[AnyA
     """
     if namespace(values) is np:
         return values[j]
-    return values.at[j].get(mode="promise_in_bounds")
+    return values.at[j].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 # Compiled once for each shape, not at every call outside jit.
@@ -83,16 +83,18 @@ def sum_slots(weights, indices, values, contracted: int):
 
     def add_group(i, total):
         for q in range(size):
-            total = add(i * size + q, total)
+            total = add(i * np.uint32(size) + np.uint32(q), total)
         return total
 
     if is_quick():
         return _scan_slots(weights, indices, values, contracted)
     size = machine().slots
     groups, left = divmod(len(indices), size)
-    total = jax.lax.fori_loop(0, groups, add_group, _zero(weights, values, contracted))
+    # Numbers without a sign need no code for negative ones.
+    start = _zero(weights, values, contracted)
+    total = jax.lax.fori_loop(np.uint32(0), np.uint32(groups), add_group, start)
     for slot in range(len(indices) - left, len(indices)):
-        total = add(slot, total)
+        total = add(np.uint32(slot), total)
     return total
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from contextlib import nullcontext
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -145,7 +144,7 @@ def build_with_surfaces(cloud, neighbors, method, target) -> tuple[Stencil, tupl
 @sized_jit
 def _weights_and_surfaces(blocks, method, target):
     def both(block):
-        around = neighborhood(block)
+        around = Neighborhood.of(*block)
         return weights_by(method, around, target), Graph.of(around, method.polynomial_degree)
 
     return blockwise(both, blocks)
@@ -228,15 +227,8 @@ def _slots_first(indices):
 
 @Pieces
 def _weights_of_blocks(blocks, count, method, target):
-    return blockwise(lambda block: weights_by(method, neighborhood(block), target), blocks, count)
-
-
-def neighborhood(block) -> Neighborhood:
-    """What the stencils of one of these blocks see."""
-    points, normals, mask, radius = block
-    # The point itself stands in slot 0.
-    offsets = jax.lax.optimization_barrier(jnp.stack([x - x[0] for x in points], axis=1))
-    return Neighborhood(offsets, jnp.stack(normals, axis=1), mask, radius)
+    weights = lambda block: weights_by(method, Neighborhood.of(*block), target)
+    return blockwise(weights, blocks, count)
 
 
 @copying_jit

@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .build import blocks_of, determined, neighborhood, rows_of
+from .build import blocks_of, determined, rows_of
 from .cloud import PointCloud
 from .compiling import Pieces, copying_jit, namespace, on_device
 from .failures import is_concrete, refuse
 from .fits.moments import blockwise, in_blocks, moment_solve
 from .fits.monomials import monomials
-from .fits.plane import TangentPlane
+from .fits.plane import Neighborhood, TangentPlane
 from .functions import constant
 from .machine import PAIRS, READ, block, block_of_pairs
 from .neighbors import Neighbors, Rows
@@ -108,7 +108,7 @@ def _seen_from(cloud, neighbors, points, centers):
 @Pieces
 def _of_blocks(blocks, count, degree: int):
     def weights(block):
-        around, offset = neighborhood(block[0]), block[1]
+        around, offset = Neighborhood.of(*block[0]), block[1]
         plane = TangentPlane.of(around, degree)
         place = jnp.sum(plane.tangents * offset, axis=1) / plane.width
         wanted = monomials(place, degree)[1:, None]

@@ -21,19 +21,22 @@ class Kept:
         self.name = name
 
     def __get__(self, owner, kind=None):
-        if owner is None:
-            return self
-        kept = vars(owner).setdefault("_kept", {})
-        if self.name in kept:
-            return kept[self.name]
-        if not is_concrete(owner):
-            # Within other traces, of a branch or a derivative, it would leak from them.
-            now = get_opaque_trace_state(convention="flax")
-            traced = vars(owner).setdefault("_traced", {})
-            if self.name not in traced or traced[self.name][0] != now:
-                traced[self.name] = now, self.make(owner)
-            return traced[self.name][1]
-        # Also where other things are traced: this is a constant of theirs.
-        with at_once():
-            kept[self.name] = self.make(owner)
-        return kept[self.name]
+        return self if owner is None else once(owner, self.name, lambda: self.make(owner))
+
+
+def once(owner, key, make: Callable):
+    """What is made of an owner, by key: once, or where the owner is traced, once in each trace."""
+    kept = vars(owner).setdefault("_kept", {})
+    if key in kept:
+        return kept[key]
+    if not is_concrete(owner):
+        # Within other traces, of a branch or a derivative, it would leak from them.
+        now = get_opaque_trace_state(convention="flax")
+        traced = vars(owner).setdefault("_traced", {})
+        if key not in traced or traced[key][0] != now:
+            traced[key] = now, make()
+        return traced[key][1]
+    # Also where other things are traced: this is a constant of theirs.
+    with at_once():
+        kept[key] = make()
+    return kept[key]

@@ -17,14 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .build import blocks_of, determined, neighborhood, rows_of
+from .build import blocks_of, determined, rows_of
 from .cloud import PointCloud
 from .compiling import copying_jit, namespace, sized_jit
 from .failures import is_concrete, refuse, warn
 from .fits.graph import Graph
 from .fits.moments import blockwise, in_blocks, moment_solve
 from .fits.monomials import polynomial_count
-from .fits.plane import TangentPlane
+from .fits.plane import Neighborhood, TangentPlane
 from .fits.polygon import Sides, moments_over, ways_of
 from .machine import CELLS, block
 from .neighbors import Neighbors
@@ -219,7 +219,7 @@ def _in_blocks(mask, size: int):
 
 @sized_jit
 def _surfaces(blocks, degree: int):
-    return blockwise(lambda block: Graph.of(neighborhood(block), degree), blocks)
+    return blockwise(lambda block: Graph.of(Neighborhood.of(*block), degree), blocks)
 
 
 @sized_jit

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..compiling import AnyArray, namespace
+from ..compiling import AnyArray, namespace, stored
 from ..frames import frames_of
+from ..kept import Kept, once
 from .kernels import gaussian, support
 from .moments import polynomial_fit
 
@@ -25,12 +26,20 @@ class Neighborhood(eqx.Module):
     mask: Bool[Array, "k *p"]
     radius: Float[Array, "*p"] | None
 
+    @classmethod
+    def of(cls, points, normals, mask, radius) -> Neighborhood:
+        """From the coordinates of the neighbours and of their normals, axis by axis."""
+        # Stored, or the derivative in each coordinate finds all that of a stencil again. (The
+        # point itself stands in slot 0; normals are of length one.)
+        offsets = stored(jnp.stack([x - x[0] for x in points], axis=1), normals[0][0, 0] > 2)
+        return cls(offsets, jnp.stack(normals, axis=1), mask, radius)
+
     def support(self, dim: int, given: float | None) -> Float[Array, "*p"]:
         """Support radius of a method: the given one, that of the search, or a length filled."""
         radius = self.radius if given is None else given
         return support(self.squared, self.mask, dim=dim, radius=radius)
 
-    @property
+    @Kept
     def squared(self) -> Float[Array, "k *p"]:
         """Squared distances from the centre."""
         return dot(self.offsets, self.offsets)
@@ -60,12 +69,17 @@ class TangentPlane(eqx.Module):
         cls, around: Neighborhood, degree: int, *, width: float | None = None, support=None
     ) -> TangentPlane:
         """With the kernel that suits polynomials of a degree, or another (see `GFDM`)."""
-        radius = around.support(around.offsets.shape[1] - 1, support)
-        unit = radius * (_width(degree) if width is None else width)
-        weights = gaussian(around.squared, unit, radius, around.mask)
-        plane = cls.at(around.normals[0], around.offsets, weights, unit, radius)
-        # Without the barrier the compiler finds exponentials again for every use of them.
-        return jax.lax.optimization_barrier(plane)
+        width = _width(degree) if width is None else width
+
+        def seen() -> TangentPlane:
+            radius = around.support(around.offsets.shape[1] - 1, support)
+            unit = radius * width
+            weights = gaussian(around.squared, unit, radius, around.mask)
+            plane = cls.at(around.normals[0], around.offsets, weights, unit, radius)
+            # Without the barrier the compiler finds exponentials again for every use of them.
+            return jax.lax.optimization_barrier(plane)
+
+        return once(around, (width, support), seen)
 
     @classmethod
     def at(cls, normal, offsets, weights, width, radius) -> TangentPlane:

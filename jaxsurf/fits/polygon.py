@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
-from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
+from ..compiling import kept
 from .graph import Expansion, Graph, polynomial
-from .moments import KEPT, blockwise
+from .moments import blockwise
 from .monomials import monomials_by_degree, polynomial_count
 from .plane import TangentPlane
 
@@ -91,7 +91,13 @@ def moments_over(sides: Sides, graph: Graph, ways):
     def half(these):
         side, after, ended = these
         none = jnp.zeros((size, *side.shape[1:]), sides.offset.dtype)
-        of_sides = lambda: _over_sides(sides.chosen(side), sides.chosen(after), by_degree)
+
+        def of_sides():
+            both = sides.chosen(jnp.concatenate([side, after]))
+            these = jax.tree.map(lambda a: a[..., : len(side), :], both)
+            those = jax.tree.map(lambda a: a[..., len(side) :, :], both)
+            return _over_sides(these, those, by_degree)
+
         return jax.lax.cond(ended, lambda: (none, none[0]), of_sides)
 
     size = polynomial_count(graph.dim, graph.degree)
@@ -277,7 +283,7 @@ def _root(misses: Callable, start, *known):
 def _root_jvp(misses, primals, tangents):
     (start, *known), (_, *moved) = primals, tangents
     x, lost = _root(misses, start, *known)
-    x = checkpoint_name(x, KEPT)
+    x = kept(x)
     slope = misses(x, *known)[1]
     _, missed = jax.jvp(lambda *known: misses(x, *known)[0], known, moved)
     return (x, lost), (-_divided(missed, slope), np.zeros(lost.shape, jax.dtypes.float0))

@@ -29,8 +29,8 @@ class Neighborhood(eqx.Module):
     @classmethod
     def of(cls, points, normals, mask, radius) -> Neighborhood:
         """From the coordinates of the neighbours and of their normals, axis by axis."""
-        # Stored, or the derivative in each coordinate finds all that of a stencil again. (The
-        # point itself stands in slot 0; normals are of length one.)
+        # The point itself stands in slot 0. Stored, as the derivative of a whole stencil would be
+        # found again for each coordinate. (No component of a unit normal is 2.)
         offsets = stored(jnp.stack([x - x[0] for x in points], axis=1), normals[0][0, 0] > 2)
         return cls(offsets, jnp.stack(normals, axis=1), mask, radius)
 

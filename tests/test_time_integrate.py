@@ -109,6 +109,54 @@ def test_the_gradient_is_the_same_with_few_copies_of_the_state():
     np.testing.assert_allclose(few, many, rtol=1e-12, atol=1e-15)
 
 
+@pytest.mark.parametrize("solver, dt0", [(js.RKC2(), 0.05), (dfx.Tsit5(), None)])
+def test_the_gradient_is_that_of_loops_with_all_numbers_apart(solver, dt0):
+    """Also with an event, times between and several of them at once."""
+    event = dfx.Event(lambda t, y, args, **_: jnp.max(y) < 0.5)
+    saveat = dfx.SaveAt(ts=jnp.linspace(0, 0.4, 4), t1=True)
+
+    def scalar(u, adjoint=None):
+        found = js.integrate(
+            HEAT, u, t1=0.5, dt0=dt0, solver=solver, event=event, saveat=saveat, adjoint=adjoint
+        )
+        ys = jnp.where(jnp.isfinite(found.ys), found.ys, 0)  # none after the event
+        return jnp.sum(ys**2) + found.ts[-1]
+
+    apart = dfx.RecursiveCheckpointAdjoint(64)
+    batch = jnp.stack([Z, 1.5 * Z])
+    together, alone = (
+        jax.vmap(jax.value_and_grad(lambda u, adjoint=adjoint: scalar(u, adjoint)))(batch)
+        for adjoint in (None, apart)
+    )
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-15), together, alone
+    )
+
+
+def test_loops_differentiated_in_reverse_keep_their_counters_in_one_array():
+    def copies(adjoint=None):
+        """Arrays of 64 whole numbers that the loop over the steps carries."""
+
+        def run(u):
+            solution = js.integrate(HEAT, u, t1=0.5, dt0=0.05, solver=js.RKC2(), adjoint=adjoint)
+            return jnp.sum(solution.ys)
+
+        copied = lambda a: a.shape[:1] == (64,) and jnp.issubdtype(a.dtype, jnp.integer)
+        loops = _loops(jax.make_jaxpr(jax.grad(run))(Z).jaxpr)
+        return max(sum(copied(v.aval) for v in loop.outvars) for loop in loops)
+
+    assert copies() <= copies(dfx.RecursiveCheckpointAdjoint(64)) - 8
+
+
+def _loops(jaxpr):
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "while":
+            yield equation
+        for part in jax.tree.leaves(list(equation.params.values())):
+            if hasattr(part, "eqns") or hasattr(part, "jaxpr"):
+                yield from _loops(getattr(part, "jaxpr", part))
+
+
 def test_derivatives_in_start_and_end_where_solutions_may_grow():
     """d/dt1 and d/dt0 of the decay by diffusion and reaction, at rate 2 + 1."""
     problem = js.AdvectionDiffusionReaction(LAPLACIAN, reaction=lambda t, u, args: -u)

@@ -29,6 +29,7 @@ from .asked import (
 from .chebyshev import Loop
 from .explicit import RKC2
 from .guard import Guard, guarded
+from .loops import RecursiveCheckpoints
 from .phases import Linear, Rest, frozen, has_phases
 from .problem import AbstractEvolution, checked_problem
 from .stability import Verdict, check_steps
@@ -190,7 +191,7 @@ def planned(
         solver, why = choose_solver(problem)
     name = type(solver).__name__
     if adjoint is None:
-        reverse = dfx.RecursiveCheckpointAdjoint(_CHECKPOINTS)
+        reverse = RecursiveCheckpoints(_CHECKPOINTS)
         adjoint = dfx.ForwardMode() if _forwards.value else reverse
     if isinstance(solver, RKC2):
         solver = _looped(solver, adjoint)

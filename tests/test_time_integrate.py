@@ -133,6 +133,20 @@ def test_the_gradient_is_that_of_loops_with_all_numbers_apart(solver, dt0):
     )
 
 
+def test_the_last_step_is_taken_where_the_state_of_every_step_is_kept():
+    """Of 64 states at most; in times that are not exact."""
+
+    def scalar(u, count, adjoint=None):
+        run = js.integrate(HEAT, u, t0=0.1, t1=0.4, dt0=0.3 / count, adjoint=adjoint)
+        return jnp.sum(run.ys**2)
+
+    for count in (1, 61, 62, 63, 64, 65):
+        value, slopes = jax.value_and_grad(scalar)(Z, count)
+        assert float(scalar(Z, count)) == pytest.approx(float(value), rel=1e-13)
+        other = jax.grad(scalar)(Z, count, dfx.RecursiveCheckpointAdjoint(100))
+        np.testing.assert_allclose(slopes, other, rtol=1e-11, atol=1e-15)
+
+
 def test_loops_differentiated_in_reverse_keep_their_counters_in_one_array():
     def copies(adjoint=None):
         """Arrays of 64 whole numbers that the loop over the steps carries."""

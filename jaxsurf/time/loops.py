@@ -10,7 +10,25 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, PyTree
+
+from ..failures import is_concrete
+
+# Of the state that are kept for the reverse pass.
+COPIES = 64
+
+
+def most_steps(t0, t1, dt0, otherwise: int) -> int:
+    """As many as copies, where so few steps of this length are known to be taken.
+
+    The state of every step is kept then: none has to be chosen, and nothing that does is compiled.
+    """
+    if dt0 is None or not is_concrete(t0, t1, dt0):
+        return otherwise
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steps = abs(np.divide(np.subtract(t1, t0), dt0))
+    return COPIES if steps < COPIES - 1 else otherwise
 
 
 class RecursiveCheckpoints(dfx.RecursiveCheckpointAdjoint):

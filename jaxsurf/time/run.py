@@ -29,7 +29,7 @@ from .asked import (
 from .chebyshev import Loop
 from .explicit import RKC2
 from .guard import Guard, guarded
-from .loops import RecursiveCheckpoints
+from .loops import COPIES, RecursiveCheckpoints, most_steps
 from .phases import Linear, Rest, frozen, has_phases
 from .problem import AbstractEvolution, checked_problem
 from .stability import Verdict, check_steps
@@ -37,8 +37,6 @@ from .states import Norm, root_mean_square
 
 _log = logging.getLogger(__name__)
 
-# Copies of the state kept for the reverse pass.
-_CHECKPOINTS = 64
 # Asked by programs while they are traced; JAX keeps those apart that were told otherwise.
 _forwards = jax.make_user_context(default_value=False)
 # A step this much shorter than the whole interval means that something diverges.
@@ -177,6 +175,7 @@ def planned(
     """Check all that `integrate` is given, and bring it into the form that is compiled."""
     checked_problem(problem)
     u0 = checked_state(problem, u0)
+    times = t0, t1, dt0  # constants, where a program makes arrays of them that it does not know
     t0, t1, dt0 = checked_times(problem, u0, t0, t1, dt0)
     args = numbers_as_arrays(args)
     for value, kind, name in (
@@ -191,7 +190,7 @@ def planned(
         solver, why = choose_solver(problem)
     name = type(solver).__name__
     if adjoint is None:
-        reverse = RecursiveCheckpoints(_CHECKPOINTS)
+        reverse = RecursiveCheckpoints(COPIES)
         adjoint = dfx.ForwardMode() if _forwards.value else reverse
     if isinstance(solver, RKC2):
         solver = _looped(solver, adjoint)
@@ -224,6 +223,9 @@ def planned(
     parts = (terms, solver, t0, t1, dt0, u0, args, controller, limit, saveat, event, adjoint)
     concrete = is_concrete(parts)  # also not inside a `jit`, which would make the limit traced
     _log.info("%s over [%s, %s] by %s", type(problem).__name__, t0, t1, why)
+    if not concrete and max_steps is None and type(controller) is dfx.ConstantStepSize:
+        # What is stored at every step is as long as there may be steps.
+        allowed = allowed if _stores_steps(saveat) else most_steps(*times, allowed)
     throw = bool(throw) and not concrete and not is_marking()
     run = Run(*parts, allowed, bool(progress), throw)
     return Plan(run, name, f"{name}: given" if why == "given" else why, concrete)

@@ -48,6 +48,23 @@ def count_compilations():
         _COUNTS.remove(names)
 
 
+def operations(jaxpr):
+    """All of a program, those of the programs in it included."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for part in jax.tree.leaves(equation.params):
+            part = getattr(part, "jaxpr", part)
+            if hasattr(part, "eqns"):
+                yield from operations(part)
+
+
+def made_in(jaxpr):
+    """Shapes and types of all arrays that a program makes."""
+    for equation in operations(jaxpr):
+        arrays = (v.aval for v in equation.outvars if hasattr(v.aval, "shape"))
+        yield from ((a.shape, a.dtype) for a in arrays)
+
+
 def label(method) -> str:
     number = method.order if isinstance(method, js.DCPSE) else method.degree
     return f"{type(method).__name__}{number}"

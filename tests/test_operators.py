@@ -11,7 +11,7 @@ import scipy.spatial.transform
 import jaxsurf as js
 from jaxsurf import operators
 
-from .helpers import KINDS, METHODS, exponential, jittered_sphere, label, relative_error
+from .helpers import KINDS, METHODS, exponential, jittered_sphere, label, made_in, relative_error
 
 CLOUD = jittered_sphere(1500)
 U, GRADIENT, LAPLACIAN = exponential(CLOUD.points)
@@ -297,17 +297,6 @@ def test_traced_diffusivities_are_looked_at(bad, text):
     if np.ndim(bad) == 0:
         with pytest.raises(eqx.EquinoxRuntimeError, match=text):
             eqx.filter_jit(jax.vmap(total))(jnp.stack([good, wrong]))
-
-
-def made_in(jaxpr):
-    """Shapes and types of all that a program makes."""
-    for equation in jaxpr.eqns:
-        yield from ((v.aval.shape, v.aval.dtype) for v in equation.outvars)
-        for inner in jax.tree.leaves(
-            equation.params, is_leaf=lambda p: hasattr(p, "eqns") or hasattr(p, "jaxpr")
-        ):
-            if hasattr(inner, "eqns") or hasattr(inner, "jaxpr"):
-                yield from made_in(getattr(inner, "jaxpr", inner))
 
 
 def test_tensor_diffusion_is_small_and_stays_in_single_precision():

@@ -14,7 +14,7 @@ import pytest
 import jaxsurf as js
 from jaxsurf.time.guard import Guard, guarded
 
-from .helpers import count_compilations, ring
+from .helpers import count_compilations, operations, ring
 
 CLOUD = js.sphere(300)
 LAPLACIAN = js.laplace_beltrami(CLOUD)
@@ -156,19 +156,11 @@ def test_loops_differentiated_in_reverse_keep_their_counters_in_one_array():
             return jnp.sum(solution.ys)
 
         copied = lambda a: a.shape[:1] == (64,) and jnp.issubdtype(a.dtype, jnp.integer)
-        loops = _loops(jax.make_jaxpr(jax.grad(run))(Z).jaxpr)
+        program = operations(jax.make_jaxpr(jax.grad(run))(Z).jaxpr)
+        loops = [operation for operation in program if operation.primitive.name == "while"]
         return max(sum(copied(v.aval) for v in loop.outvars) for loop in loops)
 
     assert copies() <= copies(dfx.RecursiveCheckpointAdjoint(64)) - 8
-
-
-def _loops(jaxpr):
-    for equation in jaxpr.eqns:
-        if equation.primitive.name == "while":
-            yield equation
-        for part in jax.tree.leaves(list(equation.params.values())):
-            if hasattr(part, "eqns") or hasattr(part, "jaxpr"):
-                yield from _loops(getattr(part, "jaxpr", part))
 
 
 def test_derivatives_in_start_and_end_where_solutions_may_grow():

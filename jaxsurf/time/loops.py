@@ -19,36 +19,42 @@ from ..failures import is_concrete
 COPIES = 64
 
 
+def count_steps(t0, t1, dt0) -> float | None:
+    """How many steps of this length there are, but for round-off; None where that is not known."""
+    if dt0 is None or not is_concrete(t0, t1, dt0):
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(np.abs((np.asarray(t1) - np.asarray(t0)) / np.asarray(dt0)))
+
+
 def most_steps(t0, t1, dt0, otherwise: int) -> int:
     """As many as copies, where so few steps of this length are known to be taken.
 
     The state of every step is kept then: none has to be chosen, and nothing that does is compiled.
     """
-    if dt0 is None or not is_concrete(t0, t1, dt0):
-        return otherwise
-    with np.errstate(divide="ignore", invalid="ignore"):
-        steps = abs(np.divide(np.subtract(t1, t0), dt0))
-    return COPIES if steps < COPIES - 1 else otherwise
+    steps = count_steps(t0, t1, dt0)
+    return COPIES if steps is not None and steps < COPIES - 1 else otherwise
 
 
 class RecursiveCheckpoints(dfx.RecursiveCheckpointAdjoint):
     """`diffrax.RecursiveCheckpointAdjoint` of a loop with all its counters in one array.
 
-    Copies of the state are kept, put in order and loaded again array by array, whatever the size:
-    some eight kernels for each, which for a dozen counters took a second to compile.
+    Copies of the state are kept, put in order and loaded again array by array, each by kernels of
+    its own, whatever its size: most of what was compiled for that was for counters.
     """
 
     @property
     def _loop(self) -> Callable:
         loop = super()._loop
 
-        def packed(*, outer_while_loop, **kwargs):
-            return loop(outer_while_loop=functools.partial(_packed, outer_while_loop), **kwargs)
+        def with_few_arrays(*, outer_while_loop, **kwargs):
+            outer = functools.partial(_with_counts_together, outer_while_loop)
+            return loop(outer_while_loop=outer, **kwargs)
 
-        return packed
+        return with_few_arrays
 
 
-def _packed(while_loop: Callable, cond_fun, body_fun, init, *, buffers, **kwargs):
+def _with_counts_together(while_loop: Callable, cond_fun, body_fun, init, *, buffers, **kwargs):
     """A loop whose state has its integers and booleans in one array."""
     init = jax.tree.map(jnp.asarray, init)
     # By name: within the loop buffers are objects, with leaves of their own.
@@ -57,7 +63,7 @@ def _packed(while_loop: Callable, cond_fun, body_fun, init, *, buffers, **kwargs
     places = {name: _Place(i, dtype) for i, (name, dtype) in enumerate(counts)}
     dtype = jnp.result_type(*(dtype for _, dtype in counts))
 
-    def packed(state) -> _State:
+    def together(state) -> _State:
         leaves = jax.tree.leaves_with_path(state)
         numbers = [jnp.asarray(leaf, dtype) for name, leaf in leaves if name in places]
         others = [places.get(name, leaf) for name, leaf in leaves]
@@ -65,8 +71,8 @@ def _packed(while_loop: Callable, cond_fun, body_fun, init, *, buffers, **kwargs
 
     end = while_loop(
         lambda state: cond_fun(state.apart()),
-        lambda state: packed(body_fun(state.apart())),
-        packed(init),
+        lambda state: together(body_fun(state.apart())),
+        together(init),
         buffers=lambda state: buffers(state.others),
         **kwargs,
     )

@@ -10,7 +10,6 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 from jaxtyping import Array, PyTree
 
@@ -29,7 +28,7 @@ from .asked import (
 from .chebyshev import Loop
 from .explicit import RKC2
 from .guard import Guard, guarded
-from .loops import COPIES, RecursiveCheckpoints, most_steps
+from .loops import COPIES, RecursiveCheckpoints, count_steps, most_steps
 from .phases import Linear, Rest, frozen, has_phases
 from .problem import AbstractEvolution, checked_problem
 from .stability import Verdict, check_steps
@@ -327,8 +326,8 @@ def _allowed(max_steps, saveat: dfx.SaveAt, t0, t1, dt0, controller) -> int:
     else:
         max_steps = _STORED_STEPS if _stores_steps(saveat) else _MANY_STEPS
     adaptive = isinstance(controller, dfx.AbstractAdaptiveStepSizeController)
-    if not given and dt0 is not None and not adaptive and is_concrete(t0, t1, dt0):
-        steps = float(np.abs((np.asarray(t1) - np.asarray(t0)) / np.asarray(dt0)))
+    steps = None if given or adaptive else count_steps(t0, t1, dt0)
+    if steps is not None:
         if steps > max_steps + 1:
             raise ValueError(
                 f"dt0 = {float(dt0):g} makes {steps:.3g} steps from {float(t0):g} to "

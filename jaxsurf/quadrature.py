@@ -19,10 +19,10 @@ from jaxtyping import Array, Bool, Float
 
 from .build import blocks_of, determined, rows_of
 from .cloud import PointCloud
-from .compiling import copying_jit, namespace, sized_jit
+from .compiling import copying_jit, kept, namespace, sized_jit, stored
 from .failures import is_concrete, refuse, warn
 from .fits.graph import Graph
-from .fits.moments import blockwise, in_blocks, moment_solve
+from .fits.moments import blockwise, in_blocks, moment_solve, out_of_blocks
 from .fits.monomials import polynomial_count
 from .fits.plane import Neighborhood, TangentPlane
 from .fits.polygon import Sides, moments_over, ways_of
@@ -172,23 +172,18 @@ def cell_weights(
         Weights `(k, n)`; whether each cell is bounded by neighbours so near that no other
         point can have a part of it; the relative moment residual of its weights.
     """
-    planes, mask, moments, closed = _cells(cloud, neighbors, degree, cells, outward, surfaces)
-    weights, residual = _weights_of_blocks(planes, mask, moments, degree)
-    weights, (closed, residual) = rows_of(weights, (closed, residual), cloud.n)
+    blocks = _blocks(cloud, neighbors, degree, outward, surfaces)
+    weights, others = _weights_of_blocks(blocks, min(cells, neighbors.k), degree)
+    weights, (closed, residual) = rows_of(weights, others, cloud.n)
     return weights, *_where_on(neighbors.mask, closed, residual)
 
 
 def _cell_sizes(cloud, neighbors, degree, cells, outward, surfaces):
-    planes, _, moments, closed = _cells(cloud, neighbors, degree, cells, outward, surfaces)
-    sizes = _scaled(planes.width, planes.points.shape[1], moments)
-    _, (sizes, closed) = rows_of(moments, (sizes, closed), cloud.n)
+    blocks = _blocks(cloud, neighbors, degree, outward, surfaces)
+    found = _sizes_of_blocks(blocks, min(cells, neighbors.k))
+    sizes, closed = (out_of_blocks(a, cloud.n) for a in found)
     closed, sizes = _where_on(neighbors.mask, closed, sizes)
     return sizes, closed
-
-
-@copying_jit
-def _scaled(width, dim: int, moments):
-    return width**dim * moments[:, 0]
 
 
 @copying_jit
@@ -197,19 +192,14 @@ def _where_on(mask, closed, values):
     return closed | ~on, namespace(values).where(on, values, 0)
 
 
-def _cells(cloud, neighbors, degree, cells, outward, surfaces):
-    """Planes, masks and moments of all cells in blocks, and whether they are closed."""
-    size, cells = block(CELLS), min(cells, neighbors.k)
+def _blocks(cloud, neighbors, degree, outward, surfaces):
+    """Surfaces over the tangent planes, masks and lines of the border, in blocks."""
+    size = block(CELLS)
     lines = None if outward is None else in_blocks(outward.T, size)
-    # Programs of their own: in one, the compiler finds much again for every use of it, and a
-    # derivative took fifteen times as long as the value.
     if surfaces is None:
         rows = np.arange(cloud.n, dtype=np.int32)
         surfaces = _surfaces(blocks_of(cloud, neighbors, rows, size), degree)
-    mask = _in_blocks(neighbors.mask, size)
-    planes, graphs = surfaces
-    ways = _ways_of_blocks(*jax.lax.stop_gradient((planes, mask, lines)), cells)
-    return planes, mask, *_moments_of_blocks(planes, graphs, mask, lines, ways, cells)
+    return *surfaces, _in_blocks(neighbors.mask, size), lines
 
 
 @copying_jit
@@ -222,34 +212,35 @@ def _surfaces(blocks, degree: int):
     return blockwise(lambda block: Graph.of(Neighborhood.of(*block), degree), blocks)
 
 
-@sized_jit
-def _ways_of_blocks(planes, mask, lines, cells: int):
-    def ways(block):
-        plane, mask, line = block
-        return ways_of(Sides.of(plane, mask, cells, line))
-
-    return blockwise(ways, (planes, mask, lines))
-
-
-@sized_jit
-def _moments_of_blocks(planes, graphs, mask, lines, ways, cells: int):
-    def moments(block):
-        plane, graph, mask, line, (ways, room) = block
-        found, reach = moments_over(Sides.of(plane, mask, cells, line), graph, ways)
-        return found, 4 * reach <= room
-
-    return blockwise(moments, (planes, graphs, mask, lines, ways))
+def _moments(block, cells: int):
+    """Of a cell, and whether it is closed."""
+    plane, graph, mask, line = block
+    sides = Sides.of(plane, mask, cells, line)
+    ways, room = jax.tree.map(kept, ways_of(jax.lax.stop_gradient(sides)))
+    moments, reach = moments_over(sides, graph, ways)
+    return stored(moments, plane.width[0] < 0), 4 * reach <= room
 
 
 @sized_jit
-def _weights_of_blocks(planes, mask, moments, degree: int):
+def _sizes_of_blocks(blocks, cells: int):
+    def size(block):
+        moments, closed = _moments(block, cells)
+        plane = block[0]
+        return plane.width ** len(plane.points) * moments[0], closed
+
+    return blockwise(size, blocks)
+
+
+@sized_jit
+def _weights_of_blocks(blocks, cells: int, degree: int):
     def weights(block):
-        plane, mask, moments = block
+        plane, _, mask, _ = block
+        moments, closed = _moments(block, cells)
         unit = plane.width ** len(plane.points)
         # The fit knows differences from the point itself: the constant is the area times its value.
         eta, _, residual = moment_solve(plane.points, plane.weights, moments[1:, None], 1, degree)
         area = jnp.where(mask[0], unit * moments[0], 0)
         eta = with_center(unit * eta)[0].at[0].add(area)
-        return jnp.where(mask, eta, 0), residual
+        return jnp.where(mask, eta, 0), (closed, residual)
 
-    return blockwise(weights, (planes, mask, moments))
+    return blockwise(weights, blocks)

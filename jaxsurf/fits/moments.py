@@ -84,7 +84,7 @@ def _solve(x, w, b, low, high):
         residual = relative(systems.symmetric(gram, a) - b)  # the moments of eta are A a
     else:
         a, s, residual = _corrected(a, s, wanted, w, v[start:], solve, relative)
-    return (w * s, condition, residual), (v, start, solve, a, s)
+    return (systems.found_once(w * s, v, w), condition, residual), (v, start, solve, a, s)
 
 
 def _corrected(a, s, wanted, w, basis, solve, relative):

@@ -8,25 +8,24 @@ plane, and Gauss's rule sums over the ways from the point to them.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from ..compiling import kept
-from .graph import Expansion, Graph, polynomial
+from .graph import Graph
 from .moments import blockwise
-from .monomials import monomials_by_degree, polynomial_count
+from .monomials import monomial_rows, multi_indices, polynomial_count
 from .plane import TangentPlane
+from .sums import spread, sums
 
-# Newton steps from cells with straight sides to those on the surface end with the one after one as
-# small as this, or after so many: each squares what is left of an error of the size
-# (spacing x curvature)^2.
-_SMALL, _STEPS = 1e-4, 8
+# Newton steps from straight sides to those on the surface: each squares what is left of an error of
+# the size (spacing x curvature)^2.
+_STEPS = 4
 # Sides that it puts so much farther out than straight ones, or behind the point, are not found.
 _STRETCH = 2.0
 # Nor are roots so far away, in units of the kernel or of the straight way.
@@ -62,11 +61,19 @@ class Sides(eqx.Module):
             on = jnp.concatenate([on, jnp.any(line != 0, axis=0)])
         return cls(flat, high, jnp.where(on, offset, 0), on)
 
-    def chosen(self, which) -> Sides:
-        """One of them at every place, by number."""
-        pick = lambda a: jnp.take_along_axis(a, which, axis=0)
-        flat = jnp.stack([pick(a) for a in self.flat])
-        return Sides(flat, pick(self.high), pick(self.offset), jnp.ones_like(which, bool))
+    def chosen(self, *places: Int[Array, "s p"]) -> list[Sequence[Float[Array, "s p"]]]:
+        """Those with the numbers at some places: d along each tangent, along the normal, and b."""
+        values = jnp.stack([*self.flat, self.high, self.offset])
+        (kinds, _, points), (rows, _) = values.shape, places[0].shape
+        at = points * jnp.stack(places) + np.arange(points, dtype=np.int32)
+        starts = np.arange(kinds, dtype=np.int32)[:, None, None] * values[0].size
+        found = (
+            values.reshape(-1)
+            .at[at[:, None] + starts]
+            .get(mode="promise_in_bounds", wrap_negative_indices=False)
+        )
+        parts = jax.lax.split(found.reshape(-1, points), (rows,) * (len(places) * kinds))
+        return [parts[i : i + kinds] for i in range(0, len(parts), kinds)]
 
 
 def moments_over(sides: Sides, graph: Graph, ways):
@@ -74,10 +81,11 @@ def moments_over(sides: Sides, graph: Graph, ways):
 
     The latter squared.
     """
-    by_degree = graph.by_degree()
     if graph.dim == 1:
-        ends, measure, which = ways
-        found, reach = _along_ways(sides.chosen(which), by_degree, ends[:, None], measure[None])
+        (end,), measure, which = ways
+        (bounds,) = sides.chosen(which)
+        given = [a[None] for a in (end, measure, *bounds, *graph.repeated(len(which)))]
+        found, reach = _along_ways(graph, given[:1], given[1], given[2:5], given[5:])
         # The nearest to either side bound a curve's cell, if it is found at all.
         return found, jnp.where(reach < jnp.inf, 0, reach)
     side, still = ways
@@ -92,95 +100,94 @@ def moments_over(sides: Sides, graph: Graph, ways):
         side, after, ended = these
         none = jnp.zeros((size, *side.shape[1:]), sides.offset.dtype)
 
-        def of_sides():
-            both = sides.chosen(jnp.concatenate([side, after]))
-            these = jax.tree.map(lambda a: a[..., : len(side), :], both)
-            those = jax.tree.map(lambda a: a[..., len(side) :, :], both)
-            return _over_sides(these, those, by_degree)
-
-        return jax.lax.cond(ended, lambda: (none, none[0]), of_sides)
+        of_sides = lambda: _over_sides(graph, *sides.chosen(side, after))
+        return jax.lax.cond(ended, lambda: (none, none[0]), jax.checkpoint(of_sides))
 
     size = polynomial_count(graph.dim, graph.degree)
     found, reach = blockwise(half, (side[halves], after[halves], jnp.stack(ended)))
     return jnp.sum(found, axis=0), jnp.max(reach, axis=0)
 
 
-def _over_sides(these: Sides, those: Sides, graph: Expansion):
+def _over_sides(graph: Graph, these, those):
     """What triangles between the point and each side add to the moments of a cell.
 
     Args:
         these: sides in turn, of which the first is that before.
         those: what cuts each of them off.
     """
-    # The planes of two sides meet in a line, which leans by so much over the plane.
-    foot = _meeting(these.offset, those.offset, these.flat, those.flat)
-    lean = -_meeting(these.high, those.high, these.flat, those.flat)
+    (*flat, high, offset), (*across, rise, room) = these, those
+    # The planes of two sides meet in a line, which leans by so much over the plane. One step of
+    # Newton's method takes it to the surface: what is left moves the moments by its square.
+    foot, lean = _meeting(offset, room, flat, across), _meeting(high, rise, flat, across)
+    coefficients = graph.repeated(len(high))
+    heights, slopes = graph.by_degree(coefficients, monomial_rows(foot, graph.degree))
+    facing = 1 + sum(sum(slope) * along for slope, along in zip(slopes, lean))
+    height = _divided(sum(heights), facing)
+    corners = [start - height * along for start, along in zip(foot, lean)]
 
-    def misses(z, foot, lean, graph):
-        height, slope = graph.at(foot + z * lean)
-        return z - height, 1 - jnp.sum(slope * lean, axis=0)
-
-    z, lost = _root(misses, jnp.zeros_like(these.high), foot, lean, graph)
-    corners = foot + z * lean
-    first, last = corners[:, :-1], corners[:, 1:]
-    turn = first[0] * last[1] - first[1] * last[0]
-    share, weights = (
-        np.array(a, turn.dtype).reshape(-1, *(1,) * turn.ndim) for a in _gauss(_nodes(graph), 0)
-    )
-    ends = first[:, None] + share * (last - first)[:, None]
-    again = jax.tree.map(lambda a: a[..., 1:, :], these)
-    found, reach = _along_ways(again, graph, ends, weights * turn)
-    foot, corners = jax.lax.stop_gradient((foot, corners))
-    lost = lost | jnp.any(jnp.abs(corners - foot) > _STRETCH * (1 + jnp.abs(foot)), axis=0)
-    far = jnp.where(lost, jnp.inf, jnp.sum(corners**2, axis=0))
+    share, weights = (np.array(a, high.dtype)[:, None, None] for a in _gauss(_nodes(graph), 0))
+    # In one go: what is transposed to it are sums over the ways in one pass.
+    given = [*(a[:-1] for a in corners), *(a[1:] for a in (*corners, *these, *coefficients))]
+    x, y, u, v, *others = spread(given, 0, len(share))
+    ends = [x + share * (u - x), y + share * (v - y)]
+    found, reach = _along_ways(graph, ends, weights * (x * v - u * y), others[:4], others[4:])
+    straight, curved = jax.lax.stop_gradient((jnp.stack(foot), jnp.stack(corners)))
+    lost = jnp.any(~(jnp.abs(curved - straight) <= _STRETCH * (1 + jnp.abs(straight))), axis=0)
+    far = jnp.where(lost, jnp.inf, jnp.sum(curved**2, axis=0))
     return found, jnp.maximum(jnp.max(far, axis=0), reach)
 
 
-def _along_ways(sides: Sides, graph: Expansion, ends, measure):
+def _along_ways(graph: Graph, ends, measure, bounds, coefficients):
     """The moments from those of ways that end at sides, and how far these reach, squared.
 
     That is infinite where the surface bends so much within the cell that a side is not found.
 
     Args:
-        ends: of the ways if the sides were straight, one or several to each side, `(t, w, r, *p)`.
-        measure: what each stands for then, `(w, r, *p)`.
+        ends: of the ways if the sides were straight, one or several to each side, `(w, r, *p)` for
+            each coordinate.
+        measure: what each stands for then.
+        bounds: what bounds each, as `Sides.chosen` gives it.
+        coefficients: of the graph.
     """
-    degree, nodes = graph.degree, _nodes(graph)
-
+    one_by_one = lambda a: a.reshape(-1, *a.shape[2:])
+    given = jax.tree.map(one_by_one, (ends, measure, bounds, coefficients))
+    ends, measure, (*flat, high, offset), coefficients = given
     # Along a way each monomial is a power, and so is what is missed of the side.
-    rows = monomials_by_degree(ends, degree)
-    heights = [sides.high * polynomial([c], [row]) for c, row in zip(graph.heights, rows[1:])]
-    heights[0] = heights[0] + jnp.sum(ends * sides.flat[:, None], axis=0)
+    rows = monomial_rows(ends, graph.degree)
+    heights, slopes = graph.by_degree(coefficients, rows)
+    missed = [high * height for height in heights]
+    missed[0] = sum((a * b for a, b in zip(ends, flat)), missed[0])
+    length, lost = _root(_horner, jnp.ones_like(measure), [-offset, *missed])
 
-    def misses(length, offset, heights):
-        beyond, rate = heights[-1], jnp.zeros_like(length)
-        for height in [*heights[-2::-1], -offset]:
-            beyond, rate = beyond * length + height, rate * length + beyond
-        return beyond, rate
+    # The area along a way by Gauss's rule, for each degree of the monomials.
+    areas: list = [0] * (graph.degree + 1)
+    measure = measure * length**graph.dim
+    for at, weight in zip(*_gauss(_nodes(graph), graph.dim - 1)):
+        square = sum(_horner(at * length, slope)[0] ** 2 for slope in slopes)
+        area = weight * measure * jnp.sqrt(1 + square)
+        for degree in range(graph.degree + 1):
+            areas[degree] = areas[degree] + area
+            area = area * (at * length)
+    degrees = multi_indices(graph.dim, 0, graph.degree).sum(axis=1)
+    found = sums([areas[degree] * row for degree, row in zip(degrees, rows)], 0)
 
-    length, lost = _root(misses, jnp.ones_like(measure), sides.offset, heights)
-    lengths = [jnp.ones_like(length)]
-    for _ in range(degree):
-        lengths.append(lengths[-1] * length)
-    measure = measure * lengths[graph.dim]
-
-    at, share = (np.array(a, length.dtype) for a in _gauss(nodes, graph.dim - 1))
-    powers = at ** np.arange(degree + 1)[:, None].astype(length.dtype)
-    square = jnp.ones((nodes, *length.shape), length.dtype)
-    for slope in graph.slopes:
-        along = [s * polynomial([c], [row]) for s, c, row in zip(lengths, slope, rows)]
-        square = square + jnp.tensordot(powers[:-1].T, jnp.stack(along), 1) ** 2
-    sums = jnp.tensordot(powers * share, jnp.sqrt(square), 1) * measure * jnp.stack(lengths)
-    found = [jnp.sum(row * total, axis=(1, 2)) for row, total in zip(rows, sums)]
-    length, ends = jax.lax.stop_gradient((length, length * ends))
+    length, *ends, offset = jax.lax.stop_gradient((length, *ends, offset))
     resolved = (length > 0) & (length < _STRETCH) & ~lost
-    reach = jnp.where(resolved, jnp.sum(ends**2, axis=0), jnp.inf)
+    reach = jnp.where(resolved, sum((length * end) ** 2 for end in ends), jnp.inf)
     # The line of a border passes through the point: there is nothing between them.
-    reach = jnp.where(sides.offset > 0, reach, 0)
-    return jnp.concatenate(found), jnp.max(reach, axis=(0, 1))
+    reach = jnp.where(offset > 0, reach, 0)
+    return jnp.stack(found), jnp.max(reach, axis=0)
 
 
-def _nodes(graph: Expansion) -> int:
+def _horner(x, coefficients):
+    """A polynomial of one variable, and its slope."""
+    value, slope = coefficients[-1], jnp.zeros_like(x)
+    for coefficient in coefficients[-2::-1]:
+        value, slope = value * x + coefficient, slope * x + value
+    return value, slope
+
+
+def _nodes(graph: Graph) -> int:
     """Of Gauss's rule: exact for the polynomials of the surface."""
     return graph.degree // 2 + 1
 
@@ -203,7 +210,8 @@ def ways_of(sides: Sides):
 def _meeting(u, v, a, b):
     r"""Where two lines meet, those of $q\cdot a = u$ and of $q\cdot b = v$."""
     size = a[0] * b[1] - a[1] * b[0]
-    return jnp.stack([b[1] * u - a[1] * v, a[0] * v - b[0] * u]) / jnp.where(size == 0, 1, size)
+    size = jnp.where(size == 0, 1, size)
+    return (b[1] * u - a[1] * v) / size, (a[0] * v - b[0] * u) / size
 
 
 def _round(flat, offset, on):
@@ -257,7 +265,7 @@ def _ways_of_curve(sides: Sides):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _root(misses: Callable, start, *known):
+def _root(misses: Callable, start, known):
     """Where what is missed vanishes, by Newton's method, and whether that was lost: then the start.
 
     Args:
@@ -265,27 +273,19 @@ def _root(misses: Callable, start, *known):
 
     Differentiable: in what is known, to any order, by the implicit function theorem.
     """
-
-    def step(state):
-        count, x, moved, _ = state
-        new = x - _divided(*misses(x, *known))
-        return count + 1, new, jnp.max(jnp.abs(new - x)), moved
-
-    # One step more than to one that is small.
-    moves = lambda state: (state[0] < _STEPS) & ~(state[3] < _SMALL)
-    infinite = jnp.asarray(jnp.inf, start.dtype)
-    x = jax.lax.while_loop(moves, step, (0, start, infinite, infinite))[1]
+    x = start
+    for _ in range(_STEPS):
+        x = x - _divided(*misses(x, known))
     lost = ~(jnp.abs(x - start) < _LOST)
     return jnp.where(lost, start, x), lost
 
 
 @_root.defjvp
 def _root_jvp(misses, primals, tangents):
-    (start, *known), (_, *moved) = primals, tangents
-    x, lost = _root(misses, start, *known)
-    x = kept(x)
-    slope = misses(x, *known)[1]
-    _, missed = jax.jvp(lambda *known: misses(x, *known)[0], known, moved)
+    (start, known), (_, moved) = primals, tangents
+    x, lost = _root(misses, start, known)
+    slope = misses(x, known)[1]
+    _, missed = jax.jvp(lambda known: misses(x, known)[0], (known,), (moved,))
     return (x, lost), (-_divided(missed, slope), np.zeros(lost.shape, jax.dtypes.float0))
 
 

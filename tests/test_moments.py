@@ -15,7 +15,13 @@ from jaxsurf.fits.moments import (
     out_of_blocks,
     polynomial_fit,
 )
-from jaxsurf.fits.monomials import differentiation, monomials, multi_indices
+from jaxsurf.fits.monomials import (
+    differentiation,
+    monomials,
+    monomials_on_lines,
+    multi_indices,
+)
+from jaxsurf.fits.polygon import _root
 from jaxsurf.fits.sums import spread, sums
 from jaxsurf.stencils.targets import Gradient, Hessian, Laplacian, Partial
 
@@ -80,6 +86,36 @@ def test_monomials_are_powers(dim, high):
     assert len(indices) == math.comb(dim + high, dim)
     expected = np.prod(x[None] ** indices[:, :, None], axis=1)
     np.testing.assert_allclose(monomials(jnp.asarray(x), high), expected, rtol=1e-13)
+
+
+def test_monomials_on_lines_are_polynomials():
+    foot, along = np.random.default_rng(0).normal(size=(2, 3, 7))
+    rows = monomials_on_lines(list(jnp.asarray(foot)), list(jnp.asarray(along)), 5)
+    found = [sum(c * 0.7**i for i, c in enumerate(row)) for row in rows]
+    expected = monomials(jnp.asarray(foot + 0.7 * along), 5)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-13)
+
+
+def test_roots_near_and_far():
+    """Of x + a x^2 = 1: by three steps and by more, and second derivatives; and none."""
+
+    def found(a):
+        return _root(1, [-jnp.ones_like(a), jnp.ones_like(a), a])
+
+    exact = lambda a: (jnp.sqrt(1 + 4 * a) - 1) / (2 * a)
+    for a in (jnp.full(3, 1e-4), jnp.array([1e-4, 0.3, 2.0])):
+        root, lost = found(a)
+        assert not lost.any()
+        np.testing.assert_allclose(root, exact(a), rtol=1e-11)
+    total = lambda f: lambda a: jnp.sum(f(a))
+    ours, theirs = (
+        jax.vmap(jax.grad(jax.grad(total(f))))(jnp.array([0.1, 0.3]))
+        for f in (lambda a: found(a[None])[0], exact)
+    )
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9)
+    # A slope that turns away is not followed.
+    none, lost = _root(1, [jnp.array([-1e9]), jnp.array([1.0]), jnp.array([0.0])])
+    assert lost.tolist() == [True] and none.tolist() == [1]
 
 
 def test_differentiation_matrices_differentiate():

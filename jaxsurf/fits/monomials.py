@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -70,13 +71,27 @@ def monomials_by_degree(x: Float[AnyArray, "dim *q"], high: int) -> list[Float[A
 
 
 def monomial_rows(
-    x: Float[Array, "dim *q"], high: int, first: Float[Array, "*q"] | None = None
+    x: Float[Array, "dim *q"] | Sequence[Float[Array, "*q"]],
+    high: int,
+    first: Float[Array, "*q"] | None = None,
 ) -> list[Float[Array, "*q"]]:
     """The same one by one, all times a common factor `first` if given."""
     coordinates = list(x)
     rows = [jnp.ones_like(x[0]) if first is None else first]
     for lower, axis in _parents(len(x), high):
         rows.append(rows[lower] * coordinates[axis])
+    return rows
+
+
+def monomials_on_lines(
+    foot: Sequence[Float[Array, "*q"]], along: Sequence[Float[Array, "*q"]], high: int
+) -> list[list[Float[Array, "*q"]]]:
+    """The same at points foot + z along, each as coefficients of powers of z."""
+    rows = [[jnp.ones_like(foot[0])]]
+    for lower, axis in _parents(len(foot), high):
+        row, x, d = rows[lower], foot[axis], along[axis]
+        between = (x * b + d * a for a, b in itertools.pairwise(row))
+        rows.append([x * row[0], *between, d * row[-1]])
     return rows
 
 

@@ -8,7 +8,7 @@ plane, and Gauss's rule sums over the ways from the point to them.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -19,13 +19,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .graph import Graph
 from .moments import blockwise
-from .monomials import monomial_rows, multi_indices, polynomial_count
+from .monomials import monomial_rows, monomials_on_lines, multi_indices, polynomial_count
 from .plane import TangentPlane
 from .sums import spread, sums
 
-# Newton steps from straight sides to those on the surface: each squares what is left of an error of
-# the size (spacing x curvature)^2.
-_STEPS = 4
+# Newton steps from straight sides to those on the surface, each of which squares what is left of an
+# error of the size (spacing x curvature)^2; and more where one of a block is not small by then.
+_STEPS, _MORE = 3, 5
 # Sides that it puts so much farther out than straight ones, or behind the point, are not found.
 _STRETCH = 2.0
 # Nor are roots so far away, in units of the kernel or of the straight way.
@@ -67,11 +67,8 @@ class Sides(eqx.Module):
         (kinds, _, points), (rows, _) = values.shape, places[0].shape
         at = points * jnp.stack(places) + np.arange(points, dtype=np.int32)
         starts = np.arange(kinds, dtype=np.int32)[:, None, None] * values[0].size
-        found = (
-            values.reshape(-1)
-            .at[at[:, None] + starts]
-            .get(mode="promise_in_bounds", wrap_negative_indices=False)
-        )
+        at = at[:, None] + starts
+        found = values.reshape(-1).at[at].get(mode="promise_in_bounds", wrap_negative_indices=False)
         parts = jax.lax.split(found.reshape(-1, points), (rows,) * (len(places) * kinds))
         return [parts[i : i + kinds] for i in range(0, len(parts), kinds)]
 
@@ -99,7 +96,6 @@ def moments_over(sides: Sides, graph: Graph, ways):
     def half(these):
         side, after, ended = these
         none = jnp.zeros((size, *side.shape[1:]), sides.offset.dtype)
-
         of_sides = lambda: _over_sides(graph, *sides.chosen(side, after))
         return jax.lax.cond(ended, lambda: (none, none[0]), jax.checkpoint(of_sides))
 
@@ -116,14 +112,16 @@ def _over_sides(graph: Graph, these, those):
         those: what cuts each of them off.
     """
     (*flat, high, offset), (*across, rise, room) = these, those
-    # The planes of two sides meet in a line, which leans by so much over the plane. One step of
-    # Newton's method takes it to the surface: what is left moves the moments by its square.
-    foot, lean = _meeting(offset, room, flat, across), _meeting(high, rise, flat, across)
     coefficients = graph.repeated(len(high))
-    heights, slopes = graph.by_degree(coefficients, monomial_rows(foot, graph.degree))
-    facing = 1 + sum(sum(slope) * along for slope, along in zip(slopes, lean))
-    height = _divided(sum(heights), facing)
-    corners = [start - height * along for start, along in zip(foot, lean)]
+    # The planes of two sides meet in a line, which leans by so much over the plane: there the
+    # height is a polynomial of the height.
+    foot = _meeting(offset, room, flat, across)
+    lean = [-along for along in _meeting(high, rise, flat, across)]
+    missed: list = [0, -1] + [0] * (graph.degree - 1)
+    for c, row in zip(coefficients, monomials_on_lines(foot, lean, graph.degree)[1:]):
+        missed[: len(row)] = [total + c * a for total, a in zip(missed, row)]
+    height, lost = _root(0, [-a for a in missed])
+    corners = [start + height * along for start, along in zip(foot, lean)]
 
     share, weights = (np.array(a, high.dtype)[:, None, None] for a in _gauss(_nodes(graph), 0))
     # In one go: what is transposed to it are sums over the ways in one pass.
@@ -132,8 +130,8 @@ def _over_sides(graph: Graph, these, those):
     ends = [x + share * (u - x), y + share * (v - y)]
     found, reach = _along_ways(graph, ends, weights * (x * v - u * y), others[:4], others[4:])
     straight, curved = jax.lax.stop_gradient((jnp.stack(foot), jnp.stack(corners)))
-    lost = jnp.any(~(jnp.abs(curved - straight) <= _STRETCH * (1 + jnp.abs(straight))), axis=0)
-    far = jnp.where(lost, jnp.inf, jnp.sum(curved**2, axis=0))
+    moved = jnp.abs(curved - straight) > _STRETCH * (1 + jnp.abs(straight))
+    far = jnp.where(lost | jnp.any(moved, axis=0), jnp.inf, jnp.sum(curved**2, axis=0))
     return found, jnp.maximum(jnp.max(far, axis=0), reach)
 
 
@@ -157,7 +155,7 @@ def _along_ways(graph: Graph, ends, measure, bounds, coefficients):
     heights, slopes = graph.by_degree(coefficients, rows)
     missed = [high * height for height in heights]
     missed[0] = sum((a * b for a, b in zip(ends, flat)), missed[0])
-    length, lost = _root(_horner, jnp.ones_like(measure), [-offset, *missed])
+    length, lost = _root(1, [-offset, *missed])
 
     # The area along a way by Gauss's rule, for each degree of the monomials.
     areas: list = [0] * (graph.degree + 1)
@@ -265,27 +263,30 @@ def _ways_of_curve(sides: Sides):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _root(misses: Callable, start, known):
-    """Where what is missed vanishes, by Newton's method, and whether that was lost: then the start.
+def _root(start: int, coefficients):
+    """Where polynomials vanish, by Newton's method, and whether that was lost: then the start.
 
-    Args:
-        misses: of x and what is known: what is missed there, and its slope in x.
-
-    Differentiable: in what is known, to any order, by the implicit function theorem.
+    Differentiable: to any order, by the implicit function theorem.
     """
-    x = start
-    for _ in range(_STEPS):
-        x = x - _divided(*misses(x, known))
+
+    def steps(x, count: int):
+        for _ in range(count):
+            before, x = x, x - _divided(*_horner(x, coefficients))
+        return x, jnp.abs(x - before)
+
+    x, moved = steps(jnp.full_like(coefficients[0], start), _STEPS)
+    small = jnp.sqrt(jnp.finfo(x.dtype).eps)
+    more = lambda x: jax.lax.fori_loop(0, _MORE, lambda _, x: steps(x, 1)[0], x)
+    x = jax.lax.cond(jnp.any(~(moved < small)), more, lambda x: x, x)
     lost = ~(jnp.abs(x - start) < _LOST)
     return jnp.where(lost, start, x), lost
 
 
 @_root.defjvp
-def _root_jvp(misses, primals, tangents):
-    (start, known), (_, moved) = primals, tangents
-    x, lost = _root(misses, start, known)
-    slope = misses(x, known)[1]
-    _, missed = jax.jvp(lambda known: misses(x, known)[0], (known,), (moved,))
+def _root_jvp(start, primals, tangents):
+    (coefficients,), (moved,) = primals, tangents
+    x, lost = _root(start, coefficients)
+    missed, slope = _horner(x, moved)[0], _horner(x, coefficients)[1]
     return (x, lost), (-_divided(missed, slope), np.zeros(lost.shape, jax.dtypes.float0))
 
 

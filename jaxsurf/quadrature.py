@@ -180,10 +180,14 @@ def cell_weights(
 
 def _cell_sizes(cloud, neighbors, degree, cells, outward, surfaces):
     blocks = _blocks(cloud, neighbors, degree, outward, surfaces)
-    found = _sizes_of_blocks(blocks, min(cells, neighbors.k))
-    sizes, closed = (out_of_blocks(a, cloud.n) for a in found)
+    sizes, closed = _side_by_side(_sizes_of_blocks(blocks, min(cells, neighbors.k)), cloud.n)
     closed, sizes = _where_on(neighbors.mask, closed, sizes)
     return sizes, closed
+
+
+@copying_jit
+def _side_by_side(found, count: int):
+    return jax.tree.map(lambda a: out_of_blocks(a, count), found)
 
 
 @copying_jit

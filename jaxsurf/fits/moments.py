@@ -84,7 +84,9 @@ def _solve(x, w, b, low, high):
         residual = relative(systems.symmetric(gram, a) - b)  # the moments of eta are A a
     else:
         a, s, residual = _corrected(a, s, wanted, w, v[start:], solve, relative)
-    return (systems.found_once(w * s, v, w), condition, residual), (v, start, solve, a, s)
+    # Their sum, which the centre's weight is made of, would compute all of them again.
+    eta = systems.found_once(w * s, v, w)
+    return (eta, condition, residual), (v, start, solve, a, s)
 
 
 def _corrected(a, s, wanted, w, basis, solve, relative):

@@ -180,13 +180,13 @@ def cell_weights(
 
 def _cell_sizes(cloud, neighbors, degree, cells, outward, surfaces):
     blocks = _blocks(cloud, neighbors, degree, outward, surfaces)
-    sizes, closed = _side_by_side(_sizes_of_blocks(blocks, min(cells, neighbors.k)), cloud.n)
+    sizes, closed = _out_of_blocks(_sizes_of_blocks(blocks, min(cells, neighbors.k)), cloud.n)
     closed, sizes = _where_on(neighbors.mask, closed, sizes)
     return sizes, closed
 
 
 @copying_jit
-def _side_by_side(found, count: int):
+def _out_of_blocks(found, count: int):
     return jax.tree.map(lambda a: out_of_blocks(a, count), found)
 
 

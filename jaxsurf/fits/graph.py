@@ -42,6 +42,7 @@ class Graph(eqx.Module):
 
 
 def _grouped(coefficients, rows, degrees: list[int]) -> list[Array]:
+    """Sums of terms, one for each degree."""
     found: dict[int, Array] = {}
     for c, row, degree in zip(coefficients, rows, degrees):
         found[degree] = found[degree] + c * row if degree in found else c * row

@@ -54,11 +54,6 @@ def _parents(dim: int, high: int) -> tuple[tuple[int, int], ...]:
 
 def monomials(x: Float[AnyArray, "dim *q"], high: int) -> Float[AnyArray, "m *q"]:
     """All monomials of degree 0 to `high`, one multiplication each, a degree at a time."""
-    return namespace(x).concatenate(monomials_by_degree(x, high))
-
-
-def monomials_by_degree(x: Float[AnyArray, "dim *q"], high: int) -> list[Float[AnyArray, "_ *q"]]:
-    """The same with each degree apart."""
     dim, xp = len(x), namespace(x)
     degrees = [xp.ones_like(x[:1])]
     for degree in range(1, high + 1):
@@ -67,7 +62,7 @@ def monomials_by_degree(x: Float[AnyArray, "dim *q"], high: int) -> list[Float[A
         lower = degrees[-1]
         tails = [math.comb(degree - 1 + dim - 1 - a, dim - 1 - a) for a in range(dim)]
         degrees.append(xp.concatenate([x[a] * lower[-t:] for a, t in enumerate(tails)]))
-    return degrees
+    return xp.concatenate(degrees)
 
 
 def monomial_rows(

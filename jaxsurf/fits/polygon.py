@@ -117,10 +117,10 @@ def _over_sides(graph: Graph, these, those):
     # height is a polynomial of the height.
     foot = _meeting(offset, room, flat, across)
     lean = [-along for along in _meeting(high, rise, flat, across)]
-    missed: list = [0, -1] + [0] * (graph.degree - 1)
+    missed: list = [0, 1] + [0] * (graph.degree - 1)
     for c, row in zip(coefficients, monomials_on_lines(foot, lean, graph.degree)[1:]):
-        missed[: len(row)] = [total + c * a for total, a in zip(missed, row)]
-    height, lost = _root(0, [-a for a in missed])
+        missed[: len(row)] = [total - c * a for total, a in zip(missed, row)]
+    height, lost = _root(0, missed)
     corners = [start + height * along for start, along in zip(foot, lean)]
 
     share, weights = (np.array(a, high.dtype)[:, None, None] for a in _gauss(_nodes(graph), 0))

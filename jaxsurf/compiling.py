@@ -15,7 +15,7 @@ from jax.ad_checkpoint import checkpoint_name
 
 from .arguments import is_array
 from .failures import is_concrete
-from .machine import CPU, PIECE, QUICK, machine
+from .machine import CPU, PIECE, QUICK, QUICKEST, machine
 
 if TYPE_CHECKING:
     AnyArray = Any  # the kind that goes in comes out
@@ -232,7 +232,8 @@ def _takes_longer_to_compile(leaves: list) -> bool:
 @functools.cache
 def _known_options() -> dict:
     """Those to compile quickly with that this jaxlib knows."""
-    return {name: value for name, value in QUICK.items() if _is_known({name: value})}
+    wanted = QUICKEST if _as_told else QUICK
+    return {name: value for name, value in wanted.items() if _is_known({name: value})}
 
 
 def _is_known(options: dict) -> bool:

@@ -26,8 +26,10 @@ MOVING, TRIED = 4096, 256
 PIECE = 8
 # Columns at once: right-hand sides, directions of a Jacobian, colours of a product of matrices.
 SOLVED, PUSHED, COLORS = 64, 32, 16
-# Of programs that are compiled quickly on a CPU.
+# Of programs that are compiled quickly on a CPU; and, for whoever asks for it, without any
+# optimisation: sooner still, but they run for longer.
 QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
+QUICKEST = QUICK | {"xla_backend_optimization_level": 0}
 
 
 class Machine(NamedTuple):

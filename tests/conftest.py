@@ -4,7 +4,7 @@ Of the cache environment variables tell, so that the commands that tests start h
 is not among them: those commands must ask for it themselves.
 
 Most of the time of a test is compilation, of programs that run for milliseconds. So they are
-optimised little, here and in the experiments and notebooks that tests start, and stencils take the
+not optimised, here and in the experiments and notebooks that tests start, and stencils take the
 form that compiles faster. Some files test the form that users' own programs have; what runs on
 several devices is optimised fully.
 """
@@ -24,13 +24,14 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 _as_users = dict(os.environ)
 # The last one spares threads where processes share the cores. A flag that is unknown ends them all.
-_quick = ["--xla_backend_optimization_level=1", "--xla_cpu_parallel_codegen_split_count=2"]
+_quick = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=2"]
 if importlib.metadata.version("jaxlib").startswith("0.10."):
     _quick.append("--xla_cpu_use_fusion_emitters=false")
 # Full collections of garbage take a third of the time in which large programs are traced.
 gc.set_threshold(700, 10, 1_000)
 os.environ["XLA_FLAGS"] = " ".join([*_quick, os.environ.get("XLA_FLAGS", "")])
-_optimised_little = {**os.environ, "JAXSURF_QUICKLY": "1"}
+os.environ["JAXSURF_QUICKLY"] = "1"
+_not_optimised = dict(os.environ)
 
 import jax
 import pytest
@@ -54,7 +55,7 @@ def environment() -> dict[str, str]:
 @pytest.fixture(scope="session")
 def quick_environment() -> dict[str, str]:
     """For commands that would be compiled for longer than they run."""
-    return _optimised_little
+    return _not_optimised
 
 
 # Files that test stencils in the form that runs faster, as users compile it in programs of theirs.

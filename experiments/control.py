@@ -36,7 +36,7 @@ _WEIGHT = 1e-4
 
 def target(x: Float[Array, " 3"]) -> Float[Array, ""]:
     """Level-set function of the bean: a spheroid, its axis an arc. It is as large as the sphere."""
-    across = jnp.hypot(x[0] + _ARC, x[2]) - _ARC
+    across = jnp.sqrt((x[0] + _ARC) ** 2 + x[2] ** 2) - _ARC
     along = _ARC * jnp.arctan2(x[2], x[0] + _ARC)
     return (across / _ACROSS) ** 2 + (x[1] / _ACROSS) ** 2 + (along / _ALONG) ** 2 - 1
 

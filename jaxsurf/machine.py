@@ -16,6 +16,7 @@ CELLS = 100  # of integrals; no power of two, see `GFDM.batch_size`
 READ = 128  # where fields are interpolated
 FITTED = 256  # whose normals are fitted
 SEARCHED = 200  # whose neighbours are searched; of 512 columns stand a page apart, twice as slow
+AGAIN = 64  # whose neighbours are searched farther away, or on one sheet
 COUNTED = 1024  # whose candidates are counted
 SHEETS = 16  # with sheets to tell apart
 PAIRS = 64  # that see all others, see `block_of_pairs`

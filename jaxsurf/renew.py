@@ -25,7 +25,7 @@ from .checks import DETOUR, LINK, RINGS, ring_size
 from .cloud import PointCloud
 from .compiling import sized_jit
 from .failures import unchecked
-from .machine import COUNTED, SHEETS, TRIED, block
+from .machine import AGAIN, COUNTED, SHEETS, TRIED, block
 from .nearest import Grid, Nearest, nearest_in
 from .neighbors import Neighbors, Rows, with_near
 from .operators import Built, built
@@ -154,9 +154,16 @@ def renewed(
         return with_near(usual, near), code, operators
     lists = _Lists(usual.indices.T, usual.mask.T, code)
     lists, changed = _adapted(search, grid, rings, fixed, lists, operators.laplacian)
-    adapted = _padded(lists, before, search.slots)
-    again = lambda: built(cloud, adapted, search.method, with_surfaces)
-    return with_near(adapted, near), lists.code, jax.lax.cond(changed, again, lambda: operators)
+
+    # Rows that find no wider list keep the one from before.
+    changed = changed | jnp.any(lists.code != code)
+
+    def again():
+        adapted = _padded(lists, before, search.slots)
+        return adapted, built(cloud, adapted, search.method, with_surfaces)
+
+    adapted, operators = jax.lax.cond(changed, again, lambda: (usual, operators))
+    return with_near(adapted, near), lists.code, operators
 
 
 def usual_lists(search: NeighborSearch, cloud: PointCloud, before: Neighbors):
@@ -225,14 +232,14 @@ def _usual(search, grid) -> tuple[Nearest, Int[Array, " n"]]:
         return again, jnp.where(again.crowded, CROWDED, jnp.where(lost, UNREACHED, 0))
 
     short = grid.on & (code == 0) & ~found.mask[-1]
-    return _for_rows(short, look, (found, code))
+    return _for_rows(short, look, (found, code), AGAIN)
 
 
 def _apart(search, grid, rings, found, lists) -> _Lists:
     """Other sheets taken out."""
     held = grid.on & (lists.code == 0) & jnp.any(found.above[: search.k], axis=0)
     look = lambda rows, _: _lists(grid, rings, rows, search.k, search.tiers[1])
-    return _for_rows(held, look, lists)
+    return _for_rows(held, look, lists, AGAIN)
 
 
 def _adapted(search, grid, rings, cloud, lists, laplacian):
@@ -265,14 +272,14 @@ def _adapted(search, grid, rings, cloud, lists, laplacian):
         return _Lists(indices, mask, wide.code), changed
 
     poor = grid.on & (lists.code == 0) & (share < search.method.least_dominance)
-    lists, changed = _for_rows(poor, look, (lists, jnp.zeros(cloud.n, bool)))
+    lists, changed = _for_rows(poor, look, (lists, jnp.zeros(cloud.n, bool)), TRIED)
     return lists, jnp.any(changed)
 
 
-def _for_rows(which, look: Callable, state):
+def _for_rows(which, look: Callable, state, size: int):
     """Some rows of the arrays of a state, which end with the axis of rows, put in by `look`."""
     n = len(which)
-    chunk = min(block(TRIED), n)
+    chunk = min(block(size), n)
     # A chunk may begin at the last of them.
     rows = jnp.nonzero(which, size=n + chunk, fill_value=n)[0].astype(jnp.int32)
     count = jnp.sum(which)

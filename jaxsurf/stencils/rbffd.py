@@ -100,7 +100,8 @@ def _right_hand_side(x, on, method, target):
 def _power(r2, exponent):
     """A power of the distance, constant below round-off (a guard r2 > 0 has failed: fused into
     several loops, r2 is 0 in one and, with fused multiply-adds, not in another)."""
-    return jnp.sqrt(jnp.maximum(r2, jnp.finfo(r2.dtype).eps ** 2)) ** exponent
+    least = jnp.finfo(r2.dtype).eps ** 2
+    return jnp.sqrt(jnp.where(r2 > least, r2, least)) ** exponent
 
 
 def _solve(a, b, k):

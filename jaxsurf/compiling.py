@@ -27,8 +27,8 @@ else:
 # depends on constants alone operation by operation.)
 at_once = jax.core.eval_context
 # The environment variable is for programs that would be compiled for longer than they run.
-_as_told = os.environ.get("JAXSURF_QUICKLY", "") not in ("", "0")
-quickly = contextvars.ContextVar("quickly", default=_as_told)
+_told = os.environ.get("JAXSURF_QUICKLY", "")
+quickly = contextvars.ContextVar("quickly", default=_told not in ("", "0"))
 
 
 def is_quick() -> bool:
@@ -232,7 +232,7 @@ def _takes_longer_to_compile(leaves: list) -> bool:
 @functools.cache
 def _known_options() -> dict:
     """Those to compile quickly with that this jaxlib knows."""
-    wanted = QUICKEST if _as_told else QUICK
+    wanted = QUICKEST if _told == "2" else QUICK
     return {name: value for name, value in wanted.items() if _is_known({name: value})}
 
 

@@ -4,9 +4,9 @@ Of the cache environment variables tell, so that the commands that tests start h
 is not among them: those commands must ask for it themselves.
 
 Most of the time of a test is compilation, of programs that run for milliseconds. So they are
-not optimised, here and in the experiments and notebooks that tests start, and stencils take the
-form that compiles faster. Some files test the form that users' own programs have; what runs on
-several devices is optimised fully.
+not optimised, here and in most experiments that tests start, and little in the notebooks, and
+stencils take the form that compiles faster. Some files test the form that users' own programs
+have; what runs on several devices is optimised fully.
 """
 
 import gc
@@ -22,16 +22,25 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # what is loaded from it was
 os.environ.setdefault("MPLBACKEND", "Agg")
 # Workers share the cores: threads of LAPACK that wait for each other there take most of the time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-_as_users = dict(os.environ)
-# The last one spares threads where processes share the cores. A flag that is unknown ends them all.
-_quick = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=2"]
-if importlib.metadata.version("jaxlib").startswith("0.10."):
-    _quick.append("--xla_cpu_use_fusion_emitters=false")
+# Workers inherit what is set below by the process that starts them.
+os.environ.setdefault("XLA_FLAGS_AS_GIVEN", os.environ.get("XLA_FLAGS", ""))
+_as_users = os.environ | {"XLA_FLAGS": os.environ["XLA_FLAGS_AS_GIVEN"], "JAXSURF_QUICKLY": ""}
+
+
+def _optimised(level: int) -> dict[str, str]:
+    """The environment of programs that are optimised little, 1, or not at all, 0."""
+    flags = [f"--xla_backend_optimization_level={level}"]
+    # Spares threads where processes share the cores. A flag that is unknown ends them all.
+    flags.append("--xla_cpu_parallel_codegen_split_count=2")
+    if importlib.metadata.version("jaxlib").startswith("0.10."):
+        flags.append("--xla_cpu_use_fusion_emitters=false")
+    flags.append(_as_users["XLA_FLAGS"])
+    return _as_users | {"XLA_FLAGS": " ".join(flags), "JAXSURF_QUICKLY": str(2 - level)}
+
+
 # Full collections of garbage take a third of the time in which large programs are traced.
 gc.set_threshold(700, 10, 1_000)
-os.environ["XLA_FLAGS"] = " ".join([*_quick, os.environ.get("XLA_FLAGS", "")])
-os.environ["JAXSURF_QUICKLY"] = "1"
-_not_optimised = dict(os.environ)
+os.environ.update(_optimised(0))
 
 import jax
 import pytest
@@ -55,7 +64,13 @@ def environment() -> dict[str, str]:
 @pytest.fixture(scope="session")
 def quick_environment() -> dict[str, str]:
     """For commands that would be compiled for longer than they run."""
-    return _not_optimised
+    return _optimised(0)
+
+
+@pytest.fixture(scope="session")
+def middle_environment() -> dict[str, str]:
+    """For commands that are compiled for about as long as they run."""
+    return _optimised(1)
 
 
 # Files that test stencils in the form that runs faster, as users compile it in programs of theirs.

@@ -12,12 +12,15 @@ from experiments.__main__ import EXPERIMENTS
 ROOT = Path(__file__).resolve().parents[1]
 # Those with bounds on what things cost, which hold of programs as users compile them.
 TIMED = ("E3",)
+# Those that run for about as long as they are compiled.
+LONG = ("conductivity", "E16", "neural-bunny", "sphere-flow")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_quick(name, tmp_path, environment, quick_environment):
-    about = environment if name in TIMED else quick_environment
+def test_quick(name, tmp_path, environment, middle_environment, quick_environment):
+    longer = environment if name in TIMED else middle_environment
+    about = longer if name in (*TIMED, *LONG) else quick_environment
     # Not double precision by the environment: the command itself must ask for it.
     about = {k: v for k, v in about.items() if k != "JAX_ENABLE_X64"}
     call = [sys.executable, "-m", "experiments", "run", name.lower(), "--quick", "--out", tmp_path]

@@ -22,7 +22,7 @@ def test_there_are_notebooks():
 
 @pytest.mark.skipif(bool(_MISSING), reason=_NEEDED)
 @pytest.mark.parametrize("path", _NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs(path, quick_environment):
+def test_notebook_runs(path, middle_environment):
     import nbformat
     from nbclient import NotebookClient
 
@@ -35,6 +35,6 @@ def test_notebook_runs(path, quick_environment):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the machinery that starts kernels
         client = NotebookClient(notebook, timeout=300, resources={"metadata": {"path": _FOLDER}})
-        client.execute(env=quick_environment)
+        client.execute(env=middle_environment)
     printed = [output.get("name") for cell in code for output in cell.outputs]
     assert "stderr" not in printed, "a cell warns"

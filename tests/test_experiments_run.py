@@ -19,8 +19,8 @@ LONG = ("conductivity", "E16", "neural-bunny", "sphere-flow")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_quick(name, tmp_path, environment, middle_environment, quick_environment):
-    longer = environment if name in TIMED else middle_environment
-    about = longer if name in (*TIMED, *LONG) else quick_environment
+    about = middle_environment if name in LONG else quick_environment
+    about = environment if name in TIMED else about
     # Not double precision by the environment: the command itself must ask for it.
     about = {k: v for k, v in about.items() if k != "JAX_ENABLE_X64"}
     call = [sys.executable, "-m", "experiments", "run", name.lower(), "--quick", "--out", tmp_path]

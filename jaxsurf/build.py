@@ -2,7 +2,9 @@ r"""From a cloud to stencils: neighbourhoods chosen, weights in blocks, what is 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,7 +25,6 @@ from .failures import (
     warn,
     without_derivatives,
 )
-from .fits.graph import Graph
 from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .indices import mask as checked_mask
 from .machine import TRIED, block
@@ -98,6 +99,11 @@ def choose_fewer_neighbors(cloud: PointCloud, method: AbstractMethod) -> Neighbo
 
 def build(cloud, neighbors, method, target, throw) -> Stencil:
     """The operator of a target, with neighbours chosen if there are none."""
+    return build_all(cloud, neighbors, method, target, throw)[0]
+
+
+def build_all(cloud, neighbors, method, target, throw) -> list[Stencil]:
+    """As `build`; of a `Joint` each of its operators."""
     instance(cloud, PointCloud, "cloud")
     instance(method, AbstractMethod, "method", "GFDM(degree=4) or DCPSE(order=2), say")
     if neighbors is not None:
@@ -111,13 +117,13 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     _check_sizes(cloud, neighbors, method, target, throw)
     if weights is None:
         weights = stencil_weights(cloud, neighbors, method, target)
-    stencil = _stencil(cloud, neighbors, *weights)
-    if throw and is_concrete(stencil.weights):
-        _check(stencil, neighbors, method, target, cloud.dim)
-    return stencil
+    stencils = _stencils(cloud, neighbors, *weights)
+    if throw and is_concrete(stencils[0].weights):
+        _check(stencils[0], neighbors, method, target, cloud.dim)
+    return stencils
 
 
-def _stencil(cloud, neighbors, values, diagnostics) -> Stencil:
+def _stencils(cloud, neighbors, values, diagnostics) -> list[Stencil]:
     border = cloud.boundary
     if border is not None and cloud.active is not None:
         border = border & cloud.active
@@ -125,35 +131,39 @@ def _stencil(cloud, neighbors, values, diagnostics) -> Stencil:
     # Lists that are known stay known in compiled code: transposes can gather there.
     with at_once() if is_concrete(neighbors.indices) else nullcontext():
         slots = _slots_first(neighbors.indices)
-    return unchecked(Stencil, slots, values, values.shape[1:-1], (), *known)
+    values = values if isinstance(values, tuple) else (values,)
+    return [unchecked(Stencil, slots, part, part.shape[1:-1], (), *known) for part in values]
 
 
-def build_with_surfaces(cloud, neighbors, method, target) -> tuple[Stencil, tuple]:
-    """The operator, and the surface over each tangent plane (`Graph.of`) in blocks; traced clouds.
+def build_with(cloud, neighbors, method, target, find: Callable) -> tuple[list[Stencil], Any]:
+    """As `build_all`, and what is found of each neighbourhood with it, in blocks; traced clouds.
 
-    In one program, where the compiler finds that both need the same moments, and sums them once.
+    In one program, where the compiler finds that both need the same moments, and sums them once;
+    and nothing that both see of a neighbourhood is stored.
     """
     neighbors = switched_on(cloud, neighbors)
     _check_sizes(cloud, neighbors, method, target, True)
     rows = np.arange(cloud.n, dtype=np.int32)
     blocks = blocks_of(cloud, neighbors, rows, block(method.batch_size))
-    weights, surfaces = _weights_and_surfaces(blocks, method, target)
-    return _stencil(cloud, neighbors, *rows_of(*weights, cloud.n)), surfaces
+    weights, found = _weights_and_more(blocks, method, target, find)
+    return _stencils(cloud, neighbors, *rows_of(*weights, cloud.n)), found
 
 
 @sized_jit
-def _weights_and_surfaces(blocks, method, target):
+def _weights_and_more(blocks, method, target, find):
     def both(block):
         around = Neighborhood.of(*block)
-        return weights_by(method, around, target), Graph.of(around, method.polynomial_degree)
+        return weights_by(method, around, target), find(around)
 
     return blockwise(both, blocks)
 
 
 def stencil_weights(
     cloud, neighbors, method, target, rows=None
-) -> tuple[Float[Array, "k *c r"], Diagnostics]:
+) -> tuple[Float[Array, "k *c r"] | tuple[Float[Array, "k *_ r"], ...], Diagnostics]:
     """Weights `(k, *components, r)` and diagnostics of all stencils, or of those of some rows.
+
+    Of a `Joint` the weights of each of its operators.
 
     Three programs. The one in the middle takes long to compile and knows nothing of the number of
     points but a rounded number of blocks, so that clouds of other sizes share it.
@@ -235,7 +245,7 @@ def _weights_of_blocks(blocks, count, method, target):
 def rows_of(weights, others, count: int):
     """Weights, with the slots first, and what else was found of the rows, out of their blocks."""
     weights, others = jax.tree.map(lambda a: out_of_blocks(a, count), (weights, others))
-    return namespace(weights).moveaxis(weights, -2, 0), others
+    return jax.tree.map(lambda a: namespace(a).moveaxis(a, -2, 0), weights), others
 
 
 # --- neighbourhoods ------------------------------------------------------------------------

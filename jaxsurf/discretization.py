@@ -126,17 +126,24 @@ class Discretization(eqx.Module):
 
     @Kept
     def _built(self) -> operators.Built:
-        where = self.cloud, self.neighbors, self.method
-        return operators.built(*where, self._is_fitted_once)
+        return operators.built(self.cloud, self.neighbors, self.method, self._cut_at_once)
 
     @property
-    def _is_fitted_once(self) -> bool:
-        """Whether areas take the surface from where the operators are built.
+    def _cut_at_once(self) -> quadrature.Cut | None:
+        """How cells are cut where that is done while the operators are built.
 
         In compiled code, where what nobody asks for is left out (and under a bare `vmap`).
         """
         compiled = not is_concrete(without_derivatives(self.cloud))
-        return compiled and quadrature.shares_fits(self.neighbors, self.method)
+        even = self.neighbors.near is None and self.border is None
+        at_once = compiled and even and self.method.shares_moments
+        return quadrature.cut_by(self.neighbors, self.method, self.cloud.dim) if at_once else None
+
+    @Kept
+    def _cells(self) -> quadrature.Cells:
+        if self._cut_at_once is not None:
+            return self._built.cells
+        return quadrature.cells_of(self.cloud, self.neighbors, self.method, self.border)
 
     @Kept
     def _gradient(self) -> Stencil:
@@ -203,7 +210,7 @@ class Discretization(eqx.Module):
             ValueError: the cell of a point is not closed by its neighbours (named by index), as
                 on a border that is not marked, or in a fold of a scan (see `cell_areas`).
         """
-        return quadrature.areas(*self._bounds)
+        return quadrature.areas(self._cells, self.neighbors, self.method.polynomial_degree)
 
     @Kept
     def cell_areas(self) -> Float[Array, " n"]:
@@ -213,13 +220,7 @@ class Discretization(eqx.Module):
         the middle of a cell is not its point. Where neighbours do not close a cell, the mean of
         theirs, with a warning. Differentiable as `areas`.
         """
-        return quadrature.cell_areas(*self._bounds)
-
-    @property
-    def _bounds(self):
-        surfaces = self._built.surfaces if self._is_fitted_once else None
-        where = self.cloud, self.neighbors, self.method, self.border
-        return *quadrature.cells_of(*where), surfaces
+        return quadrature.cell_areas(self._cells, self.neighbors)
 
     def integrate(self, u: Float[Array, "n *c"]) -> Float[Array, "*c"]:
         r"""$\int_S u\,dS$ of a field or of each of its components."""
@@ -329,8 +330,8 @@ class Discretization(eqx.Module):
 
     def _renewed(self, cloud: PointCloud, search: NeighborSearch) -> Discretization:
         """The surface of another cloud of the same points, with neighbours of its own."""
-        once = Discretization(cloud, self.neighbors, search.method)._is_fitted_once
-        neighbors, found, built = renewed(search, cloud, self.neighbors, once)
+        there = Discretization(cloud, self.neighbors, search.method, self.border)
+        neighbors, found, built = renewed(search, cloud, self.neighbors, there._cut_at_once)
         # What has turned no list found anew would hold.
         found = jnp.where(folded(cloud, self.neighbors), 2, found)
         surface = Discretization(cloud, neighbors, search.method, self.border, found=found)

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .arguments import POINTS, as_float, finite, instance, switched_off, whole
-from .build import build, build_with_surfaces
+from .build import build, build_all, build_with
 from .cloud import PointCloud
-from .compiling import copying_jit
 from .failures import is_concrete, refuse, without_derivatives
 from .neighbors import Neighbors, find_neighbors
+from .quadrature import Cells, Cut, cells_in_rows
 from .stencils.algebra import Composition
 from .stencils.dcpse import FlatDCPSE
 from .stencils.gathers import take
@@ -108,30 +108,28 @@ class Built(NamedTuple):
 
     Args:
         gradient: from the same factorisation of the moment matrices; None if these are not shared.
-        surfaces: over the tangent planes, see `build_with_surfaces`.
+        cells: those of integrals, if they were cut in the same program.
     """
 
     laplacian: Stencil
     gradient: Stencil | None = None
-    surfaces: tuple | None = None
+    cells: Cells | None = None
 
 
-def built(cloud, neighbors, method, with_surfaces: bool = False) -> Built:
-    """As `laplace_beltrami`; with surfaces if they are wanted and the method shares its moments."""
+def built(cloud, neighbors, method, cut: Cut | None = None) -> Built:
+    """As `laplace_beltrami`, and what a method that shares its moments gives with it.
+
+    Args:
+        cut: cells are cut too, of a traced cloud.
+    """
     if not method.shares_moments:
         return Built(laplace_beltrami(cloud, neighbors, method=method))
-    both, surfaces = Joint((Laplacian(), Gradient())), None
-    if with_surfaces:
-        found, surfaces = build_with_surfaces(cloud, neighbors, method, both)
-    else:
-        found = build(cloud, neighbors, method, both, True)
-    laplacian, gradient = _first_and_others(found.weights)
-    return Built(found.of_weights(laplacian), found.of_weights(gradient, (cloud.dim,)), surfaces)
-
-
-@copying_jit
-def _first_and_others(weights):
-    return weights[:, 0], weights[:, 1:]
+    both = Joint((Laplacian(), Gradient()))
+    if cut is None:
+        laplacian, gradient = build_all(cloud, neighbors, method, both, True)
+        return Built(laplacian, gradient)
+    (laplacian, gradient), cells = build_with(cloud, neighbors, method, both, cut)
+    return Built(laplacian, gradient, cells_in_rows(cells, cloud.n))
 
 
 def surface_divergence(

@@ -10,8 +10,9 @@ all neighbours, exactly as those of a derivative come from its values on monomia
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,49 +23,110 @@ from .cloud import PointCloud
 from .compiling import copying_jit, kept, namespace, sized_jit, stored
 from .failures import is_concrete, refuse, warn
 from .fits.graph import Graph
-from .fits.moments import blockwise, in_blocks, moment_solve, out_of_blocks
+from .fits.moments import blockwise, in_blocks, moment_solve
 from .fits.monomials import polynomial_count
-from .fits.plane import Neighborhood, TangentPlane
+from .fits.plane import Neighborhood
 from .fits.polygon import Sides, moments_over, ways_of
 from .machine import CELLS, block
 from .neighbors import Neighbors
 from .stencils.method import AbstractMethod, with_center
 
 # So many neighbours may bound a cell; where points are very uneven, all are tried.
-_CELLS = 24
+_SIDES = 24
 
 
-def cells_of(cloud: PointCloud, neighbors: Neighbors, method: AbstractMethod, border):
-    """Arguments of `areas` and `cell_areas`, looked at."""
+class Cells(NamedTuple):
+    """The cells of all points, or of those of a block.
+
+    Args:
+        weights: of the neighbours in the integral over each cell.
+        sizes: their areas.
+        closed: whether each is bounded by neighbours so near that no other point can have a part of
+            it.
+        residual: the relative moment residual of its weights.
+    """
+
+    weights: Float[Array, "k *p"]
+    sizes: Float[Array, "*p"]
+    closed: Bool[Array, "*p"]
+    residual: Float[Array, "*p"]
+
+
+class Cut(eqx.Module):
+    """How the cells of a block of points are cut out of the surface.
+
+    Args:
+        degree: of the polynomials.
+        sides: the first so many neighbours may bound a cell, the point itself included.
+    """
+
+    degree: int = eqx.field(static=True)
+    sides: int = eqx.field(static=True)
+
+    def __call__(self, around: Neighborhood, line: Float[Array, "d *p"] | None = None) -> Cells:
+        """Args: the line is the border where the surface ends, by its conormal, elsewhere zero."""
+        plane, graph = Graph.of(around, self.degree)
+        on = around.mask[0]
+        sides = Sides.of(plane, around.mask, self.sides, line)
+        ways, room = jax.tree.map(kept, ways_of(jax.lax.stop_gradient(sides)))
+        moments, reach = moments_over(sides, graph, ways)
+        moments = stored(moments, plane.width[0] < 0)
+        unit = plane.width ** len(plane.points)
+        # The fit knows differences from the point itself: the constant is the area times its value.
+        b = moments[1:, None]
+        eta, _, residual = moment_solve(plane.points, plane.weights, b, 1, self.degree)
+        area = jnp.where(on, unit * moments[0], 0)
+        eta = with_center(unit * eta)[0].at[0].add(area)
+        weights, residual = jnp.where(around.mask, eta, 0), jnp.where(on, residual, 0)
+        return Cells(weights, area, (4 * reach <= room) | ~on, residual)
+
+
+def cut_by(neighbors: Neighbors, method: AbstractMethod, dim: int) -> Cut:
+    """The usual one; where points are uneven, by all neighbours.
+
+    Traced ones cannot be asked whether these close their cells.
+    """
     degree = method.polynomial_degree
-    need = polynomial_count(cloud.dim - 1, degree)
+    need = polynomial_count(dim - 1, degree)
     if neighbors.k < need:
         raise ValueError(
             f"k = {neighbors.k} neighbours, polynomials of degree {degree} need at least {need}"
         )
-    if border is None:
-        return cloud, neighbors, degree, None
-    outward = jnp.zeros_like(cloud.points).at[border.points].set(border.conormals(cloud))
-    return cloud, neighbors, degree, outward
+    return Cut(degree, neighbors.k if neighbors.near is not None else min(_SIDES, neighbors.k))
 
 
-def shares_fits(neighbors: Neighbors, method: AbstractMethod) -> bool:
-    """Whether surfaces in blocks may come from where a method's stencils are built."""
-    same = neighbors.near is None and block(method.batch_size) == block(CELLS)
-    return method.shares_moments and same
+def cells_of(cloud: PointCloud, neighbors: Neighbors, method: AbstractMethod, border) -> Cells:
+    """All cells; if the usual number of neighbours closes not all of them, by all neighbours."""
+    cut, size = cut_by(neighbors, method, cloud.dim), block(CELLS)
+    neighbors, lines = neighbors.nearest, None
+    if border is not None:
+        outward = jnp.zeros_like(cloud.points).at[border.points].set(border.conormals(cloud))
+        lines = in_blocks(outward.T, size)
+    blocks = blocks_of(cloud, neighbors, np.arange(cloud.n, dtype=np.int32), size)
+
+    def by(cut: Cut) -> Cells:
+        return cells_in_rows(_cells_of_blocks(blocks, lines, cut), cloud.n)
+
+    cells = by(cut)
+    if is_concrete(cells.closed) and not np.all(cells.closed) and cut.sides < neighbors.k:
+        return by(Cut(cut.degree, neighbors.k))
+    return cells
 
 
-def areas(
-    cloud: PointCloud,
-    neighbors: Neighbors,
-    degree: int,
-    outward: Float[Array, "n d"] | None,
-    surfaces: tuple[TangentPlane, Graph] | None = None,
-) -> Float[Array, " n"]:
-    """Weights of the points in integrals over the surface; arguments as of `cell_weights`."""
-    uneven, neighbors = neighbors.near is not None, neighbors.nearest
-    look = lambda cells: cell_weights(cloud, neighbors, degree, cells, outward, surfaces)
-    weights, closed, residual = _by_enough(look, neighbors.k, uneven)
+def cells_in_rows(blocks: Cells, count: int) -> Cells:
+    """Out of their blocks."""
+    weights, others = rows_of(blocks.weights, blocks[1:], count)
+    return Cells(weights, *others)
+
+
+@sized_jit
+def _cells_of_blocks(blocks, lines, cut: Cut) -> Cells:
+    return blockwise(lambda block: cut(Neighborhood.of(*block[0]), block[1]), (blocks, lines))
+
+
+def areas(cells: Cells, neighbors: Neighbors, degree: int) -> Float[Array, " n"]:
+    """Weights of the points in integrals over the surface."""
+    neighbors = neighbors.nearest
     more = 2 * neighbors.k
     text = (
         "the neighbours of point {i} do not close its cell, out of {v} of them: mark the "
@@ -72,32 +134,24 @@ def areas(
         f"js.discretize(cloud, js.find_neighbors(cloud, k={more})); in folds of a scan that is of "
         "no use, but surface.cell_areas @ u integrates to second order"
     )
-    bad, count = _open(closed, neighbors.mask)
-    found = refuse(_summed(weights, neighbors.indices), bad, text, count)
-    return determined(found, residual, degree)
+    bad, count = _open(cells.closed, neighbors.mask)
+    found = refuse(_summed(cells.weights, neighbors.indices), bad, text, count)
+    return determined(found, cells.residual, degree)
 
 
-def cell_areas(
-    cloud: PointCloud,
-    neighbors: Neighbors,
-    degree: int,
-    outward: Float[Array, "n d"] | None,
-    surfaces: tuple[TangentPlane, Graph] | None = None,
-) -> Float[Array, " n"]:
-    """Areas of the cells themselves, arguments as of `cell_weights`.
+def cell_areas(cells: Cells, neighbors: Neighbors) -> Float[Array, " n"]:
+    """Areas of the cells themselves.
 
     Where neighbours do not close a cell, as at folds of a scan, the mean of theirs, with a warning.
     """
-    uneven, neighbors = neighbors.near is not None, neighbors.nearest
-    look = lambda cells: _cell_sizes(cloud, neighbors, degree, cells, outward, surfaces)
-    sizes, closed = _by_enough(look, neighbors.k, uneven)
+    closed = cells.closed
     if is_concrete(closed) and not np.all(closed):
         warn(
             f"the cells of {int((~closed).sum())} points, the first {int(jnp.argmin(closed))}, "
             "are not closed by their neighbours and are given the mean area of theirs: is a "
             "border not marked?"
         )
-    sizes, bad = _completed(sizes, closed, neighbors)
+    sizes, bad = _completed(cells.sizes, closed, neighbors.nearest)
     return refuse(sizes, bad, "the cell of point {i} has the area {v}", sizes)
 
 
@@ -112,18 +166,6 @@ def _completed(sizes, closed, neighbors):
     on = neighbors.mask[:, 0]
     sizes = xp.where(good | ~on, sizes, mean)
     return sizes, on & ~(sizes > 0)
-
-
-def _by_enough(look: Callable, k: int, uneven: bool):
-    """What the usual number of sides gives; where that closes not all cells, all neighbours.
-
-    Uneven points are taken to need all, as traced ones cannot be asked.
-    """
-    if uneven:
-        return look(k)
-    found = look(_CELLS)
-    closed = found[1]
-    return look(k) if is_concrete(closed) and not np.all(closed) else found
 
 
 @copying_jit
@@ -150,101 +192,3 @@ def integral(areas, u):
 def mean(areas, u):
     """Integral over area."""
     return integral(areas, u) / jnp.sum(areas)
-
-
-def cell_weights(
-    cloud: PointCloud,
-    neighbors: Neighbors,
-    degree: int,
-    cells: int,
-    outward: Float[Array, "n d"] | None,
-    surfaces: tuple[TangentPlane, Graph] | None = None,
-) -> tuple[Float[Array, "k n"], Bool[Array, " n"], Float[Array, " n"]]:
-    """Weights of the neighbours in the integral over each cell, and what may be wrong with it.
-
-    Args:
-        degree: of the polynomials.
-        cells: the first so many neighbours may bound a cell, the point itself included.
-        outward: conormals where the surface ends, zero elsewhere.
-        surfaces: the surface over each tangent plane, in blocks; None: to be fitted.
-
-    Returns:
-        Weights `(k, n)`; whether each cell is bounded by neighbours so near that no other
-        point can have a part of it; the relative moment residual of its weights.
-    """
-    blocks = _blocks(cloud, neighbors, degree, outward, surfaces)
-    weights, others = _weights_of_blocks(blocks, min(cells, neighbors.k), degree)
-    weights, (closed, residual) = rows_of(weights, others, cloud.n)
-    return weights, *_where_on(neighbors.mask, closed, residual)
-
-
-def _cell_sizes(cloud, neighbors, degree, cells, outward, surfaces):
-    blocks = _blocks(cloud, neighbors, degree, outward, surfaces)
-    sizes, closed = _out_of_blocks(_sizes_of_blocks(blocks, min(cells, neighbors.k)), cloud.n)
-    closed, sizes = _where_on(neighbors.mask, closed, sizes)
-    return sizes, closed
-
-
-@copying_jit
-def _out_of_blocks(found, count: int):
-    return jax.tree.map(lambda a: out_of_blocks(a, count), found)
-
-
-@copying_jit
-def _where_on(mask, closed, values):
-    on = mask[:, 0]
-    return closed | ~on, namespace(values).where(on, values, 0)
-
-
-def _blocks(cloud, neighbors, degree, outward, surfaces):
-    """Surfaces over the tangent planes, masks and lines of the border, in blocks."""
-    size = block(CELLS)
-    lines = None if outward is None else in_blocks(outward.T, size)
-    if surfaces is None:
-        rows = np.arange(cloud.n, dtype=np.int32)
-        surfaces = _surfaces(blocks_of(cloud, neighbors, rows, size), degree)
-    return *surfaces, _in_blocks(neighbors.mask, size), lines
-
-
-@copying_jit
-def _in_blocks(mask, size: int):
-    return in_blocks(mask.T, size)
-
-
-@sized_jit
-def _surfaces(blocks, degree: int):
-    return blockwise(lambda block: Graph.of(Neighborhood.of(*block), degree), blocks)
-
-
-def _moments(block, cells: int):
-    """Of a cell, and whether it is closed."""
-    plane, graph, mask, line = block
-    sides = Sides.of(plane, mask, cells, line)
-    ways, room = jax.tree.map(kept, ways_of(jax.lax.stop_gradient(sides)))
-    moments, reach = moments_over(sides, graph, ways)
-    return stored(moments, plane.width[0] < 0), 4 * reach <= room
-
-
-@sized_jit
-def _sizes_of_blocks(blocks, cells: int):
-    def size(block):
-        moments, closed = _moments(block, cells)
-        plane = block[0]
-        return plane.width ** len(plane.points) * moments[0], closed
-
-    return blockwise(size, blocks)
-
-
-@sized_jit
-def _weights_of_blocks(blocks, cells: int, degree: int):
-    def weights(block):
-        plane, _, mask, _ = block
-        moments, closed = _moments(block, cells)
-        unit = plane.width ** len(plane.points)
-        # The fit knows differences from the point itself: the constant is the area times its value.
-        eta, _, residual = moment_solve(plane.points, plane.weights, moments[1:, None], 1, degree)
-        area = jnp.where(mask[0], unit * moments[0], 0)
-        eta = with_center(unit * eta)[0].at[0].add(area)
-        return jnp.where(mask, eta, 0), (closed, residual)
-
-    return blockwise(weights, blocks)

@@ -29,6 +29,7 @@ from .machine import AGAIN, COUNTED, SHEETS, TRIED, block
 from .nearest import Grid, Nearest, nearest_in
 from .neighbors import Neighbors, Rows, with_near
 from .operators import Built, built
+from .quadrature import Cut
 from .sheets import cosine_slack
 from .stencils.method import AbstractMethod
 from .stencils.targets import Laplacian
@@ -134,7 +135,7 @@ def _candidates(grid, reach: int):
 
 @sized_jit
 def renewed(
-    search: NeighborSearch, cloud: PointCloud, before: Neighbors, with_surfaces: bool
+    search: NeighborSearch, cloud: PointCloud, before: Neighbors, cut: Cut | None = None
 ) -> tuple[Neighbors, Int[Array, " n"], Built]:
     """Lists of a moved cloud, a code for each, and operators that are built with them.
 
@@ -143,11 +144,11 @@ def renewed(
     Args:
         before: lists of the same points before they moved. They say how far to look; a row without
             room for a new list keeps that one.
-        with_surfaces: as of `built`.
+        cut: as of `built`.
     """
     fixed = jax.tree.map(jax.lax.stop_gradient, cloud)
     usual, code, (grid, rings) = usual_lists(search, fixed, before)
-    operators = built(cloud, usual, search.method, with_surfaces)
+    operators = built(cloud, usual, search.method, cut)
     # Where the lists before had none, those of all points are even, or nearly.
     near = None if before.near is None else usual
     if not search.sizes:
@@ -160,7 +161,7 @@ def renewed(
 
     def again():
         adapted = _padded(lists, before, search.slots)
-        return adapted, built(cloud, adapted, search.method, with_surfaces)
+        return adapted, built(cloud, adapted, search.method, cut)
 
     adapted, operators = jax.lax.cond(changed, again, lambda: (usual, operators))
     return with_near(adapted, near), lists.code, operators

@@ -73,8 +73,8 @@ class Shards(eqx.Module):
         normals: Float[Array, "m d"],
         method: AbstractMethod,
         target: AbstractTarget,
-    ) -> Float[Array, "k *c m"]:
-        """Weights of the stencils of a device's points; under `shard_map`."""
+    ) -> Float[Array, "k *c m"] | tuple[Float[Array, "k *_ m"], ...]:
+        """Weights as of `stencil_weights`, of a device's points; under `shard_map`."""
         around = self.exchange(jnp.concatenate([points, normals], axis=1))
         cloud = PointCloud(*jnp.split(around, 2, axis=1))
         own = np.arange(len(points), dtype=np.int32)

@@ -89,8 +89,11 @@ class AbstractMethod(eqx.Module):
     @abc.abstractmethod
     def weights(
         self, neighborhood: Neighborhood, target: AbstractTarget
-    ) -> tuple[Float[Array, "... k *p"], Diagnostics]:
-        """Weights of stencils, `(*components, k, *p)`, in units of length to the minus order."""
+    ) -> tuple[Float[Array, "... k *p"] | tuple[Float[Array, "... k *p"], ...], Diagnostics]:
+        """Weights of stencils, `(*components, k, *p)`, in units of length to the minus order.
+
+        As `target.assemble` gives them: of a `Joint` those of each of its operators.
+        """
 
     @property
     def polynomial_degree(self) -> int:
@@ -113,10 +116,11 @@ class AbstractMethod(eqx.Module):
         """How many stencils are computed at once: enough to be fast, few enough for the cache."""
 
 
-def weights_by(
-    method: AbstractMethod, around: Neighborhood, target: AbstractTarget
-) -> tuple[Float[Array, "... k *p"], Diagnostics]:
+def weights_by(method: AbstractMethod, around: Neighborhood, target: AbstractTarget):
     """Those of a method, which may be a user's own, if they are what they have to be.
+
+    Returns:
+        Weights `(*components, k, *p)`, of a `Joint` those of each of its operators; diagnostics.
 
     Raises:
         TypeError, ValueError: they are not.
@@ -126,19 +130,26 @@ def weights_by(
     if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Diagnostics)):
         kinds = type(found).__name__
         raise TypeError(f"{name} returns a {kinds}, expected an array and Diagnostics")
-    values = as_float(found[0], name)
-    if values.shape[values.ndim - len(want) :] != want:
-        raise ValueError(f"{name} has shape {values.shape}, expected (*components, {str(want)[1:]}")
+    joint = isinstance(target, Joint)
+    targets = target.targets if isinstance(target, Joint) else (target,)
+    parts = found[0] if joint else found[:1]
+    if not (isinstance(parts, tuple) and len(parts) == len(targets)):
+        kinds = f"a tuple of {len(targets)} arrays, as target.assemble gives them"
+        raise TypeError(f"{name} of several operators are {type(parts).__name__}, expected {kinds}")
+    values = [as_float(part, name) for part in parts]
+    for part in values:
+        if part.shape[part.ndim - len(want) :] != want:
+            raise ValueError(
+                f"{name} has shape {part.shape}, expected (*components, {str(want)[1:]}"
+            )
     diagnostics = jax.tree.map(jax.lax.stop_gradient, found[1])
-    joint = isinstance(target, Joint) and isinstance(target.targets[0], Laplacian)
-    if not (joint or isinstance(target, Laplacian)):
-        return values, diagnostics
-    calmed, share = _calmed(method, around, values[0] if joint else values, found[1].support)
-    share = jax.lax.stop_gradient(share)
-    diagnostics = eqx.tree_at(
-        lambda d: d.dominance, diagnostics, share, is_leaf=lambda leaf: leaf is None
-    )
-    return values.at[0].set(calmed) if joint else calmed, diagnostics
+    if isinstance(targets[0], Laplacian):
+        values[0], share = _calmed(method, around, values[0], found[1].support)
+        share = jax.lax.stop_gradient(share)
+        diagnostics = eqx.tree_at(
+            lambda d: d.dominance, diagnostics, share, is_leaf=lambda leaf: leaf is None
+        )
+    return tuple(values) if joint else values[0], diagnostics
 
 
 # Positive weights have taken over where the share of the centre has fallen so far below what is

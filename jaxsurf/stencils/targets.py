@@ -96,7 +96,7 @@ class Hessian(AbstractTarget):
 
 
 class Joint(AbstractTarget):
-    """Several operators at once, their components one after another, in the tangent plane.
+    """Several operators at once, in the tangent plane.
 
     For methods whose moments are the same for all orders of derivatives.
     """
@@ -120,8 +120,10 @@ class Joint(AbstractTarget):
         return jnp.concatenate([target.in_units(part, length, dim) for target, part in parts])
 
     def assemble(self, weights, axes):
-        found = [target.assemble(part, axes) for target, part in self._parts(weights, len(axes))]
-        return jnp.concatenate([part.reshape(-1, *weights.shape[1:]) for part in found])
+        # Apart, so that a compiler leaves out those that nobody asks for.
+        return tuple(
+            target.assemble(part, axes) for target, part in self._parts(weights, len(axes))
+        )
 
 
 class Partial(AbstractTarget):

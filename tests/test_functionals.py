@@ -219,6 +219,21 @@ def test_derivatives_of_signed_distances():
     np.testing.assert_allclose(found, js.signed_distance(ball(), targets), atol=1e-5)
 
 
+def test_second_derivatives_of_signed_distances():
+    r"""In a point 1 / (R + h) along the tangents of a ball; in the shape beside differences."""
+    x, size = ball().cloud.points[7], 1.3
+    distance = lambda y: js.signed_distance(ball(), y[None])[0]
+    found = jax.jit(jax.hessian(distance))(size * x)
+    np.testing.assert_allclose(found, (jnp.eye(3) - jnp.outer(x, x)) / size, atol=2e-2)
+    targets = 1.3 * ball().cloud.points[::40]
+    value = lambda a: jnp.sum(
+        js.signed_distance(stretched(a * jnp.array([1.0, 0.9, 0.8])), targets)
+    )
+    slope = jax.jit(lambda a: jax.jvp(jax.grad(value), (a,), (1.0,)))
+    near = [slope(1.0 + step)[0] for step in (1e-4, -1e-4)]
+    np.testing.assert_allclose(slope(1.0)[1], (near[0] - near[1]) / 2e-4, rtol=1e-5)
+
+
 def test_curves_compiled_mapped_and_in_single_precision():
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)

@@ -118,8 +118,9 @@ class NormalShape(AbstractShape):
 
     def __call__(self, theta: Float[Array, " n"]) -> Discretization:
         theta = as_float(theta, "displacements", (self.surface.n,))
-        cloud = self.surface.cloud
-        return self.surface.moved(cloud.points + (theta - self.start)[:, None] * cloud.normals)
+        points, normals = starts(self.surface.cloud)
+        far = switched_off(self.surface.cloud.active, theta - self.start)
+        return self.surface.moved(points + far[:, None] * normals)
 
     def renewed(self, theta: Float[Array, " n"], search: NeighborSearch) -> NormalShape:
         """As of any shape; the surface at theta is the reference, its normals fitted again."""

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from ..arguments import as_float, traced_call
 from ..compiling import sized_jit
 from ..discretization import Discretization
-from ..failures import marking
+from ..failures import marking, needs_values
 from ..functions import Traced, canonical
 from ..motion import judged, unreached
 from .crossing import crosses, pierces
@@ -222,7 +222,9 @@ def evaluated(problem, theta, multipliers, updates=None, scale=1.0) -> tuple[PyT
     """Parameters after a share of some updates, and what is seen there."""
     updates = jax.tree.map(jnp.zeros_like, theta) if updates is None else updates
     with marking():
-        return _evaluated(problem, theta, multipliers, updates, jnp.asarray(scale))
+        found = _evaluated(problem, theta, multipliers, updates, jnp.asarray(scale))
+    needs_values("what functions, shape and optimizer close over", found)
+    return found
 
 
 @sized_jit

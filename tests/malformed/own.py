@@ -63,6 +63,7 @@ class Method(js.AbstractMethod):
 
     change: object = eqx.field(static=True, default=lambda found: found)
     counts: tuple = eqx.field(static=True, default=(7, 3, 64))
+    degree: object = eqx.field(static=True, default=2)
 
     def neighbor_count(self, dim):
         return self.counts[0]
@@ -73,6 +74,10 @@ class Method(js.AbstractMethod):
     @property
     def batch_size(self):
         return self.counts[2]
+
+    @property
+    def polynomial_degree(self):
+        return self.degree
 
     def weights(self, neighborhood, target):
         return self.change(js.GFDM(degree=2).weights(neighborhood, target))
@@ -172,5 +177,9 @@ CASES = [
     Case("AbstractMethod", "weights without diagnostics", lambda: built(change=lambda found: found[0]), ("weights of Method", "Diagnostics")),
     Case("AbstractMethod", "no neighbours", lambda: built(counts=(0, 3, 64)), ("neighbor_count", "0", "1")),
     Case("AbstractMethod", "half a polynomial", lambda: built(counts=(7, 2.5, 64)), ("basis_size", "2.5")),
+    *(
+        Case("AbstractMethod", f"polynomials of degree {degree}", lambda degree=degree: js.discretize(js.circle(N), method=Method(degree=degree)), ("polynomial_degree of Method", *words))
+        for degree, words in ((0, ("0", "at least 1")), (2.5, ("2.5", "whole number")), ("two", ("'two'", "whole number")))
+    ),
     Case("AbstractMethod", "empty blocks", lambda: built(counts=(7, 3, 0)), ("batch_size", "0", "1")),
 ]  # fmt: skip

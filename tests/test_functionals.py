@@ -134,6 +134,15 @@ def test_derivatives_of_what_the_surface_does():
     check_remainders(functionals, stretched)
 
 
+def test_a_volume_has_no_derivative_in_where_it_is():
+    """Though on a coarse peanut normals do not add up to nothing: what is shifted is the same."""
+    x = ball().cloud.points
+    peanut = (0.7 + 0.6 * x[:, 2:] ** 2 + 0.2 * x[:, :1] * x[:, 1:2]) * x
+    volume = lambda shift: js.volume(ball().moved(peanut + shift))
+    slope = jax.jit(jax.grad(volume))(jnp.zeros(3))
+    np.testing.assert_allclose(slope, 0, atol=1e-11)
+
+
 def test_compliance_of_the_ball():
     r"""$4\pi a^2 / 3 / (2 / a^2 + \kappa)$ for the load z / a on a sphere of radius a."""
     z = ball().cloud.points[:, 2]

@@ -55,7 +55,7 @@ def volume(surface: Discretization) -> Float[Array, ""]:
     """
     closed(surface)
     x, normals = surface.cloud.seen.points, surface.cloud.seen.normals
-    height = jnp.sum((x - surface.mean(stop_gradient(x))) * normals, axis=1)
+    height = jnp.sum((x - surface.mean(x)) * normals, axis=1)
     return surface.integrate(height) / surface.cloud.dim
 
 

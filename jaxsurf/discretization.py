@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from . import curvature, operators, quadrature
-from .arguments import as_float, as_many, finite, instance, switched_off
+from .arguments import as_float, as_many, finite, instance, switched_off, whole
 from .borders.border import Border
 from .borders.order import marked_border
 from .build import choose_neighbors
@@ -58,6 +58,8 @@ class Discretization(eqx.Module):
         if not isinstance(self.cloud, PointCloud):
             return  # a pytree of something else, as transformations make them
         as_many("neighbors", self.neighbors.n, "the cloud", self.cloud.n)
+        name = f"polynomial_degree of {type(self.method).__name__}"
+        whole(self.method.polynomial_degree, name, least=1)
 
     def __repr__(self):
         return f"Discretization({self.cloud!r}, {self.neighbors!r}, {self.method!r})"

@@ -189,12 +189,17 @@ def test_harmonics_are_orthonormal_and_harmonic():
         assert float(jnp.abs(jnp.trace(hessian, axis1=1, axis2=2)).max()) < 1e-10
 
 
+def padded():
+    """The ball with 20 rows that are switched off, in which no number stands."""
+    cloud, off = ball().cloud, jnp.full((20, 3), jnp.nan)
+    rows = [jnp.concatenate([a, off]) for a in (cloud.points, cloud.normals)]
+    return js.PointCloud(*rows, active=jnp.arange(N + 20) < N)
+
+
 @pytest.mark.parametrize("name", ["star", "map", "level set"])
 def test_switched_off_points_have_no_part_in_derivatives(name):
     """Whatever stands there, and where the map has none at the origin: those of the others."""
-    cloud, off = ball().cloud, jnp.zeros((20, 3))
-    rows = [jnp.concatenate([a, off * jnp.nan]) for a in (cloud.points, cloud.normals)]
-    part = js.PointCloud(*rows, active=jnp.arange(N + 20) < N)
+    cloud, part = ball().cloud, padded()
     unit = lambda x, a: a[0] * x / jnp.linalg.norm(x)
     make, theta = {
         "star": (lambda surface: js.star_shape(surface, 4), BALL.at[7].set(0.2)),
@@ -205,6 +210,19 @@ def test_switched_off_points_have_no_part_in_derivatives(name):
     slopes = lambda shape: jax.grad(lambda t: js.volume(shape(t)))(theta)
     found, wanted = slopes(shape(part)), slopes(shape(cloud))
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("start", [None, 0.0])
+def test_free_forms_have_no_derivative_in_displacements_of_switched_off_points(start):
+    """Zero, not NaN: an optimisation of all rows could not begin."""
+    far = 0.1 * ball().cloud.points[:, 2]
+    surface = js.discretize(padded(), method=js.GFDM(degree=2))
+    theta = jnp.concatenate([far, jnp.full(20, jnp.nan)])
+    shape = js.NormalShape(surface, start if start is None else start * theta)
+    slopes = lambda shape, theta: jax.grad(lambda t: js.volume(shape(t)))(theta)
+    found, wanted = slopes(shape, theta), slopes(js.NormalShape(ball()), far)
+    np.testing.assert_allclose(found[:N], wanted, rtol=1e-9, atol=1e-9)
+    assert not found[N:].any()
 
 
 def test_rotations_are_smooth_at_none():

@@ -134,6 +134,15 @@ def test_derivatives_of_what_the_surface_does():
     check_remainders(functionals, stretched)
 
 
+def test_a_volume_has_no_derivative_in_where_it_is():
+    """Though on a coarse peanut normals do not add up to nothing: what is shifted is the same."""
+    x = ball().cloud.points
+    peanut = (0.7 + 0.6 * x[:, 2:] ** 2 + 0.2 * x[:, :1] * x[:, 1:2]) * x
+    volume = lambda shift: js.volume(ball().moved(peanut + shift))
+    slope = jax.jit(jax.grad(volume))(jnp.zeros(3))
+    np.testing.assert_allclose(slope, 0, atol=1e-11)
+
+
 def test_compliance_of_the_ball():
     r"""$4\pi a^2 / 3 / (2 / a^2 + \kappa)$ for the load z / a on a sphere of radius a."""
     z = ball().cloud.points[:, 2]
@@ -217,6 +226,21 @@ def test_derivatives_of_signed_distances():
     found = js.signed_distance(less, single(targets))
     assert found.dtype == jnp.float32
     np.testing.assert_allclose(found, js.signed_distance(ball(), targets), atol=1e-5)
+
+
+def test_second_derivatives_of_signed_distances():
+    r"""In a point 1 / (R + h) along the tangents of a ball; in the shape beside differences."""
+    x, size = ball().cloud.points[7], 1.3
+    distance = lambda y: js.signed_distance(ball(), y[None])[0]
+    found = jax.jit(jax.hessian(distance))(size * x)
+    np.testing.assert_allclose(found, (jnp.eye(3) - jnp.outer(x, x)) / size, atol=2e-2)
+    targets = 1.3 * ball().cloud.points[::40]
+    value = lambda a: jnp.sum(
+        js.signed_distance(stretched(a * jnp.array([1.0, 0.9, 0.8])), targets)
+    )
+    slope = jax.jit(lambda a: jax.jvp(jax.grad(value), (a,), (1.0,)))
+    near = [slope(1.0 + step)[0] for step in (1e-4, -1e-4)]
+    np.testing.assert_allclose(slope(1.0)[1], (near[0] - near[1]) / 2e-4, rtol=1e-5)
 
 
 def test_curves_compiled_mapped_and_in_single_precision():

@@ -220,12 +220,26 @@ def test_fields_know_nothing_of_points_that_are_off():
     alone = js.PointCloud(cloud.points[on], cloud.normals[on])
     method, xi = js.GFDM(degree=2), noise(N)
     whole, part = (
-        js.MaternPrior(js.discretize(c, method=method), 0.5, 1.0, mean=1.0) for c in (masked, alone)
+        js.MaternPrior(js.discretize(c, method=method), 0.5, 1.0, mean=mean)
+        for c, mean in ((masked, jnp.where(jnp.asarray(on), 1.0, jnp.nan)), (alone, 1.0))
     )
     assert relative_error(whole.color(xi)[on], part.color(xi[on])) < 1e-6
     assert relative_error(whole.whiten(xi)[on], part.whiten(xi[on])) < 1e-9
     assert relative_error(whole.variance(xi)[on], part.variance(xi[on])) < 1e-6
     assert not whole.whiten(xi)[~on].any() and not whole.variance(xi)[~on].any()
+    assert not whole.color(xi)[~on].any()
+
+
+@pytest.mark.parametrize("count", [2, N])
+def test_components_of_fields_are_independent(count):
+    """As many as points too, where a mass of a point could be taken for one of a component."""
+    prior = js.MaternPrior(ball(), 0.5, 1.0, mean=ball().cloud.points[:, 0])
+    xi = noise((N, count))
+    fields = prior.color(xi)
+    for i in (0, 1):
+        assert relative_error(fields[:, i], prior.color(xi[:, i])) < 1e-6
+    assert relative_error(prior.whiten(fields), xi) < 1e-6
+    assert relative_error(prior.variance(xi)[:, 1], prior.variance(xi[:, 1])) < 1e-12
 
 
 def test_other_data_compile_nothing():

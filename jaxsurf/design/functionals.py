@@ -55,7 +55,7 @@ def volume(surface: Discretization) -> Float[Array, ""]:
     """
     closed(surface)
     x, normals = surface.cloud.seen.points, surface.cloud.seen.normals
-    height = jnp.sum((x - surface.mean(stop_gradient(x))) * normals, axis=1)
+    height = jnp.sum((x - surface.mean(x)) * normals, axis=1)
     return surface.integrate(height) / surface.cloud.dim
 
 
@@ -172,8 +172,8 @@ def signed_distance(surface: Discretization, points: Float[Array, "m d"]) -> Flo
 
     Accuracy: error $O(h^{p+1})$ with p the polynomial degree of the method
         (`tests/test_functionals.py::test_signed_distances`); in float32 within 1e-5.
-    Differentiable: forward and reverse, in y and in points and normals of the surface, for fixed
-        nearest points. The derivative in y is n.
+    Differentiable: forward and reverse, twice, in y and in points and normals of the surface, for
+        fixed nearest points. The derivative in y is n.
     Raises:
         TypeError: what is no discretisation or array of numbers.
         ValueError: a surface with a border; points of another shape or not finite, or whose feet
@@ -210,8 +210,10 @@ def signed_distance(surface: Discretization, points: Float[Array, "m d"]) -> Flo
     points = refuse(points, beyond(feet.left, feet.most), text, feet.left, most=feet.most)
     if is_concrete(known, feet):  # at the prompt nothing is read again
         return determined(feet.height, feet.residual, degree)
-    f, n, _ = _above(cloud, neighbors, degree, feet.place, feet.center)
-    return _along(points - f, n)[:, 0]
+    f, n, tangents, _ = _above(cloud, neighbors, degree, feet.place, feet.center)
+    # The place is fixed: what the way leans off the normal, zero here, has a second derivative.
+    lean = jnp.einsum("mad,md->ma", tangents, points - f)
+    return _along(points - f, n)[:, 0] + jnp.einsum("ma,mab,mb->m", lean, feet.bend, lean) / 2
 
 
 class _Feet(NamedTuple):
@@ -226,6 +228,7 @@ class _Feet(NamedTuple):
         reach: how far the list of that one reaches.
         residual: of the fit there.
         height: of the point above its foot.
+        bend: second derivatives of the distance in what the way leans along the tangents.
     """
 
     place: Float[Array, "m d"]
@@ -236,6 +239,7 @@ class _Feet(NamedTuple):
     reach: Float[Array, " m"]
     residual: Float[Array, " m"]
     height: Float[Array, " m"]
+    bend: Float[Array, "m t t"]
 
 
 @sized_jit
@@ -253,8 +257,8 @@ def _feet(cloud, neighbors, points, nearest, degree: int) -> _Feet:
         beside = place + small * reach[:, None] * tangents
         look = lambda place: _above(cloud, neighbors, degree, place, center, check=False)
         # Together: what is looked up is compiled once.
-        fs, ns, residuals = jax.vmap(look)(jnp.concatenate([place[None], beside]))
-        f, n, ns, residual = fs[0], ns[0], ns[1:], residuals[0]
+        fs, ns, moved, residuals = jax.vmap(look)(jnp.concatenate([place[None], beside]))
+        f, n, ns, moved, residual = fs[0], ns[0], ns[1:], moved[0], residuals[0]
         height = _along(points - f, n)
         off = points - f - height * n
         left = jnp.linalg.norm(off, axis=1)
@@ -273,7 +277,8 @@ def _feet(cloud, neighbors, points, nearest, degree: int) -> _Feet:
         good = residual < residual_tolerance(residual.dtype)
         most = jnp.where(good, jnp.finfo(f.dtype).eps ** 0.5 * reach, jnp.inf)
         left = jnp.where(least, left, jnp.linalg.norm(points - f, axis=1))
-        found = _Feet(place, center, left, most, distance, reach, residual, height[:, 0])
+        bend = _bend(moved, bends, height[:, :, None])
+        found = _Feet(place, center, left, most, distance, reach, residual, height[:, 0], bend)
         done = (found.left <= most)[:, None]
         return found, jnp.where(done, place, f + step), count + 1
 
@@ -283,7 +288,9 @@ def _feet(cloud, neighbors, points, nearest, degree: int) -> _Feet:
 
     x = cloud.points[nearest]
     none = jnp.zeros_like(points[:, 0])
-    first = _Feet(points, nearest, none + jnp.inf, *(none,) * 5)
+    count = points.shape[1] - 1
+    bend = jnp.zeros((len(points), count, count), points.dtype)
+    first = _Feet(points, nearest, none + jnp.inf, *(none,) * 5, bend)
     return jax.lax.while_loop(goes_on, nearer, (first, x, 0))[0]
 
 
@@ -291,8 +298,18 @@ def _tangents(cloud, center) -> Float[Array, "t m d"]:
     return jnp.moveaxis(frames_of(cloud.normals[center])[:, :-1], 1, 0)
 
 
+def _bend(tangents, turns, height) -> Float[Array, "m t t"]:
+    r"""$(g + h W)^{-1} W g^{-1}$ with g of the tangents, W of these and the turns of normals.
+
+    A point at height h and, off its normal, at $\tau$ is $h + \tau^2 / (2 (R + h))$ from a ball.
+    """
+    g = jnp.einsum("mad,mbd->mab", tangents, tangents)
+    w = jnp.einsum("mad,bmd->mab", tangents, turns)
+    return jnp.linalg.solve(g + height * w, jnp.linalg.solve(g, w.mT).mT)
+
+
 def _above(cloud, neighbors, degree: int, place, center, *, check: bool = True):
-    """The surface over some places, the unit normals that belong to it, residuals of the fits."""
+    """The surface over some places, its unit normals, its tangents, residuals of the fits."""
     x = cloud.points
     read = lambda q: read_from(cloud, neighbors, degree, q, center, x, check=check)
     along = lambda t: jax.jvp(read, (place,), (t,))
@@ -300,7 +317,7 @@ def _above(cloud, neighbors, degree: int, place, center, *, check: bool = True):
         _tangents(cloud, center)
     )
     n = crossed(moved)
-    return f, n / jnp.linalg.norm(n, axis=1, keepdims=True), residual
+    return f, n / jnp.linalg.norm(n, axis=1, keepdims=True), moved, residual
 
 
 def _along(v, n):

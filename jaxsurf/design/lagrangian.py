@@ -15,11 +15,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from ..arguments import as_float, traced_call
 from ..compiling import sized_jit
 from ..discretization import Discretization
-from ..failures import marking
+from ..failures import marking, needs_values
 from ..functions import Traced, canonical
 from ..motion import judged, unreached
 from .crossing import crosses, pierces
-from .shape import AbstractShape
+from .shape import AbstractShape, surface_of
 
 # Lists are found anew once points outside may come as near as this share of the farthest in them.
 _WORN = 0.75
@@ -118,6 +118,13 @@ def _number(found: Any, name: str) -> Array:
     """What a function of the user's returns, which has to have a slope."""
     if bool in [getattr(x, "dtype", type(x)) for x in jax.tree.leaves(found)]:
         raise TypeError(f"{name} is true or false, expected a number: a - b in place of a > b, say")
+    if isinstance(found, tuple | list):
+        kind = type(found).__name__
+        raise TypeError(f"{name} is a {kind}, expected one array of numbers: jnp.stack makes one")
+    if jnp.issubdtype(getattr(found, "dtype", float), jnp.integer):
+        raise TypeError(
+            f"{name} is of type {found.dtype}, which has no slope: expected real numbers"
+        )
     return as_float(found, name)
 
 
@@ -163,7 +170,8 @@ class Problem(eqx.Module):
         arrays, structure = jax.tree.flatten(arrays)
 
         def seen(arrays, theta, args):
-            surface = eqx.combine(jax.tree.unflatten(structure, arrays), others)(theta)
+            shape = eqx.combine(jax.tree.unflatten(structure, arrays), others)
+            surface = surface_of(shape, theta)
             return *_judged(surface), asked.measured(surface, args)
 
         with marking():
@@ -222,7 +230,9 @@ def evaluated(problem, theta, multipliers, updates=None, scale=1.0) -> tuple[PyT
     """Parameters after a share of some updates, and what is seen there."""
     updates = jax.tree.map(jnp.zeros_like, theta) if updates is None else updates
     with marking():
-        return _evaluated(problem, theta, multipliers, updates, jnp.asarray(scale))
+        found = _evaluated(problem, theta, multipliers, updates, jnp.asarray(scale))
+    needs_values("what functions, shape and optimizer close over", found)
+    return found
 
 
 @sized_jit

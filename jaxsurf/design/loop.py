@@ -33,7 +33,14 @@ from .lagrangian import (
     with_penalty,
 )
 from .outcome import COLUMNS, ShapeOptimization
-from .shape import AbstractShape, renewed_with_room, unchecked_surface, with_wear
+from .shape import (
+    AbstractShape,
+    checked_shape,
+    renewed_with_room,
+    surface_of,
+    unchecked_surface,
+    with_wear,
+)
 
 # A step that fails is halved so often.
 _HALVINGS = 12
@@ -115,9 +122,9 @@ class Loop(NamedTuple):
     def run(self, shape: AbstractShape, theta) -> tuple[ShapeOptimization, bool]:
         """What is found, and whether it failed."""
         clock, renew = time.perf_counter(), self.numbers["renew"]
-        shape = shape.rebuilt(theta) if renew else shape
+        shape = checked_shape(shape.rebuilt(theta), shape, "rebuilt") if renew else shape
         try:
-            surface = shape(theta)
+            surface = surface_of(shape, theta)
         except ValueError:
             surface = unchecked_surface(shape, theta)
             if not (renew and is_only_far(surface)):

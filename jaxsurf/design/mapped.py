@@ -24,6 +24,7 @@ from .shape import (
     renewed_with_room,
     spread_evenly,
     starts,
+    surface_of,
     unchecked_surface,
     with_lists,
     with_room,
@@ -83,7 +84,7 @@ class MappedShape(AbstractShape):
         if isinstance(self.base, AbstractShape):
             own, theta = _parts(theta)
             with unjudged():
-                surface = self.base(own)
+                surface = surface_of(self.base, own)
         else:
             surface = self.base
         points, normals = starts(surface.cloud)

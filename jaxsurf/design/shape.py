@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ..arguments import as_float, finite, instance, switched_off
+from ..arguments import as_float, finite, instance, switched_off, traced_call
 from ..cloud import PointCloud
 from ..compiling import sized_jit
 from ..discretization import Discretization
@@ -118,8 +118,9 @@ class NormalShape(AbstractShape):
 
     def __call__(self, theta: Float[Array, " n"]) -> Discretization:
         theta = as_float(theta, "displacements", (self.surface.n,))
-        cloud = self.surface.cloud
-        return self.surface.moved(cloud.points + (theta - self.start)[:, None] * cloud.normals)
+        points, normals = starts(self.surface.cloud)
+        far = switched_off(self.surface.cloud.active, theta - self.start)
+        return self.surface.moved(points + far[:, None] * normals)
 
     def renewed(self, theta: Float[Array, " n"], search: NeighborSearch) -> NormalShape:
         """As of any shape; the surface at theta is the reference, its normals fitted again."""
@@ -139,6 +140,18 @@ def check_surface(surface: Any) -> None:
     instance(surface, Discretization, "surface", "js.discretize(cloud) makes one")
 
 
+def surface_of(shape: AbstractShape, theta: PyTree) -> Discretization:
+    """The surface of a shape, which may be a user's own, if it is one."""
+    found = traced_call(shape, type(shape).__name__, theta)
+    name = f"the surface of {type(shape).__name__}"
+    return instance(found, Discretization, name, "surface.moved(points) makes one")
+
+
+def checked_shape(found: Any, shape: AbstractShape, by: str) -> AbstractShape:
+    """What a method of a shape made of it, if it is a shape."""
+    return instance(found, AbstractShape, f"what {type(shape).__name__}.{by} returns")
+
+
 def unchecked_surface(shape: AbstractShape, theta: PyTree) -> Discretization:
     """The surface, its lists in whatever state."""
     with marking():
@@ -147,12 +160,12 @@ def unchecked_surface(shape: AbstractShape, theta: PyTree) -> Discretization:
 
 @sized_jit
 def _unchecked(shape, theta):
-    return shape(theta)
+    return surface_of(shape, theta)
 
 
 def renewed_with_room(shape: AbstractShape, theta: PyTree, search: NeighborSearch) -> AbstractShape:
     """Renewed with a search, or where it has no room with one made for the points."""
-    return with_room(type(shape).renewed, shape, theta, search)
+    return checked_shape(with_room(type(shape).renewed, shape, theta, search), shape, "renewed")
 
 
 def with_room(renew: Callable, shape, theta, search) -> AbstractShape:

@@ -107,7 +107,7 @@ class MaternPrior(AbstractPrior):
     noise W (Lindgren, Rue and Lindström 2011, Section 2, with $\alpha = 2$), of the symmetric
     Laplacian and masses of the surface: $A = (\kappa^2 - \Delta_S)^{-1} m^{-1/2} / \tau$.
     On a surface the smoothness is $\nu = 1$: values are mean-square differentiable just not; on
-    a curve it is 3/2.
+    a curve it is 3/2. Components of a field `(n, c)` are independent of each other.
 
     Args:
         surface: where the field lives.
@@ -162,20 +162,25 @@ class MaternPrior(AbstractPrior):
         self.operator = kappa**2 - laplacian
         self.preconditioner = multigrid(self.operator, mean_zero=False)
         self.tau = jnp.asarray(tau, self.mass.dtype)
-        known = shaped(finite(as_float(mean, "mean"), "mean"), "mean", (), (surface.n,))
-        self.mean = known.astype(self.mass.dtype)
+        on = surface.cloud.active
+        known = shaped(finite(as_float(mean, "mean"), "mean", on), "mean", (), (surface.n,))
+        self.mean = switched_off(on, known).astype(self.mass.dtype)
 
     def color(self, xi):
         xi = as_float(xi, "xi", (*self.mass.shape, ...))
-        mass = switched_off(self.operator.active, self.mass, 1)
-        noise = switched_off(self.operator.active, xi / jnp.sqrt(mass)) / self.tau
-        return self.mean + self._solved(noise)
+        on = self.operator.active
+        root = jnp.sqrt(switched_off(on, self.mass, 1))
+        noise = switched_off(on, (xi.T / root).T) / self.tau
+        return (self.mean + self._solved(noise).T).T
 
     def whiten(self, theta):
-        return self.tau * jnp.sqrt(self.mass) * self.operator(theta - self.mean)
+        theta = as_float(theta, "theta", (*self.mass.shape, ...))
+        off = self.operator((theta.T - self.mean).T)
+        return self.tau * (jnp.sqrt(self.mass) * off.T).T
 
     def variance(self, theta):
-        return _variance(self, self.mass.shape[0])
+        known = _variance(self, self.mass.shape[0])
+        return jnp.broadcast_to(known, jnp.shape(theta)[::-1]).T
 
     def _solved(self, noise):
         inverse = self.preconditioner

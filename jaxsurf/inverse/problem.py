@@ -19,7 +19,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from ..compiling import sized_jit
-from ..failures import marking
+from ..failures import marking, needs_values
 from ..machine import PUSHED
 from ..time.run import forwards
 from .priors import AbstractPrior
@@ -121,13 +121,18 @@ def _failing_softly():
 def seen(problem: Problem, xi: PyTree) -> Seen:
     """Energies; those of models that fail are no numbers."""
     with _failing_softly():
-        return _seen(problem, xi)
+        return _known(_seen(problem, xi))
 
 
 def slope(problem: Problem, xi: PyTree) -> Seen:
     """Energies with the gradient."""
     with _failing_softly():
-        return _slope(problem, xi)
+        return _known(_slope(problem, xi))
+
+
+def _known(found: Any) -> Any:
+    needs_values("what forward and optimizer close over", found)
+    return found
 
 
 def newton(problem: Problem, xi: PyTree, tolerance: Any, max_steps: Any):
@@ -199,9 +204,13 @@ def conjugate(step, gradient, falls, before: tuple):
     return jax.tree.map(lambda a, b: jnp.where(good, a, b), (both, slope), (step, falls))
 
 
-@sized_jit
 def descent(optimizer, problem, xi, now: Seen, state):
     """Updates by an optimiser of optax, and its state."""
+    return _known(_descent(optimizer, problem, xi, now, state))
+
+
+@sized_jit
+def _descent(optimizer, problem, xi, now: Seen, state):
     optimizer = optax.with_extra_args_support(optimizer)
     energy = lambda xi: problem.energy(xi)[0]
     about = dict(value=now.energy, grad=now.gradient, value_fn=energy)

@@ -8,6 +8,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 import jaxsurf as js
 
@@ -67,6 +68,9 @@ CALLS = [
     ("solve_inverse", "no linear steps", inverted(linear_steps=0), ("linear_steps = 0", "at least 1")),
     ("solve_inverse", "a tolerance of zero", inverted(tol=0.0), ("tol = 0", "above 0")),
     ("solve_inverse", "traced", lambda: jax.jit(lambda a: inverted(theta=a)().theta)(ONE), ("theta", "traced")),
+    ("solve_inverse", "a model of what is differentiated", lambda: jax.grad(lambda a: inverted(lambda t: a * line(t))().theta)(1.0), ("forward and optimizer close over", "traced")),
+    ("solve_inverse", "a model of what is mapped", lambda: jax.vmap(lambda a: inverted(lambda t: a * line(t))().theta)(THREE), ("forward and optimizer close over", "traced")),
+    ("solve_inverse", "a rate that is differentiated", lambda: jax.grad(lambda a: inverted(data=2 * THREE, optimizer=optax.sgd(a))().theta)(1e-5), ("forward and optimizer close over", "traced")),
     ("GaussianPrior", "a deviation of zero", lambda: js.GaussianPrior(jnp.array([1.0, 0.0])), ("deviation 0 of unknown 1", "positive")),
     ("GaussianPrior", "text", lambda: js.GaussianPrior("wide"), ("deviation", "'wide'")),
     ("GaussianPrior", "a mean that is no number", lambda: js.GaussianPrior(1.0, jnp.array([0.0, np.nan])), ("mean nan of unknown 1",)),

@@ -7,11 +7,14 @@ import functools
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+import optax
 
 import jaxsurf as js
 
 from ..helpers import ring
 from . import Case
+from .design import surface
 
 N = 12
 
@@ -60,6 +63,7 @@ class Method(js.AbstractMethod):
 
     change: object = eqx.field(static=True, default=lambda found: found)
     counts: tuple = eqx.field(static=True, default=(7, 3, 64))
+    degree: object = eqx.field(static=True, default=2)
 
     def neighbor_count(self, dim):
         return self.counts[0]
@@ -71,6 +75,10 @@ class Method(js.AbstractMethod):
     def batch_size(self):
         return self.counts[2]
 
+    @property
+    def polynomial_degree(self):
+        return self.degree
+
     def weights(self, neighborhood, target):
         return self.change(js.GFDM(degree=2).weights(neighborhood, target))
 
@@ -80,6 +88,25 @@ class Motion(js.AbstractMotion):
 
     def velocity(self, t, surface, fields, args):
         return self.how(surface.cloud.points)
+
+
+class Shape(js.AbstractShape):
+    surface: js.Discretization
+    how: object = eqx.field(static=True)
+    again: object = eqx.field(static=True, default=lambda shape: shape)
+
+    def __call__(self, theta):
+        return self.how(self.surface.moved(theta * self.surface.cloud.points))
+
+    def rebuilt(self, theta, search=None):
+        return self.again(self)
+
+
+def shaped(
+    how=lambda surface: surface, f=lambda surface: jnp.mean(surface.cloud.points**2), **options
+):
+    shape = Shape(surface(), how, **options)
+    return js.optimize_shape(f, shape, 1.0, optimizer=optax.sgd(0.1), steps=1)
 
 
 def moved(how):
@@ -115,6 +142,15 @@ CASES = [
         Case("AbstractOperator", f"gives {label} in a sum", lambda how=how: (Operator(how) - 1)(u0()), ("Operator", *words))
         for label, (how, words) in WRONG.items()
     ),
+    *(
+        Case("AbstractShape", f"gives {label}", lambda how=how: shaped(how), ("the surface of Shape", "Discretization", word))
+        for label, how, word in (("None", lambda s: None, "None"), ("a cloud", lambda s: s.cloud, "PointCloud"), ("two", lambda s: (s, s), "tuple"))
+    ),
+    Case("AbstractShape", "gives a cloud to be mapped", lambda: js.MappedShape(lambda x, a: a * x, Shape(surface(), lambda s: s.cloud))((1.0, 1.0)), ("the surface of Shape", "Discretization")),
+    Case("AbstractShape", "in NumPy", lambda: shaped(lambda s: s.moved(np.asarray(s.cloud.points))), ("Shape needs values", "jax.numpy")),
+    Case("AbstractShape", "no shape again", lambda: shaped(again=lambda shape: None), ("Shape.rebuilt", "None")),
+    Case("optimize_shape", "an objective of two numbers", lambda: shaped(f=lambda s: (s.areas.sum(), 1.0)), ("objective is a tuple", "jnp.stack")),
+    Case("optimize_shape", "an objective that counts", lambda: shaped(f=lambda s: jnp.sum(s.cloud.points > 0)), ("objective is of type int", "slope")),
     Case("AbstractOperator", "no matrix to solve by", lambda: js.solve(Operator(lambda u: u), u0()), ("matrix", "Operator", "to_scipy")),
     Case("AbstractOperator", "no matrix for modes", lambda: js.eigenmodes(Operator(lambda u: u), 2), ("matrix", "Operator", "to_scipy")),
     Case("AbstractOperator", "no diagonal", lambda: js.jacobi(Operator(lambda u: u)), ("diagonal", "Operator")),
@@ -141,5 +177,9 @@ CASES = [
     Case("AbstractMethod", "weights without diagnostics", lambda: built(change=lambda found: found[0]), ("weights of Method", "Diagnostics")),
     Case("AbstractMethod", "no neighbours", lambda: built(counts=(0, 3, 64)), ("neighbor_count", "0", "1")),
     Case("AbstractMethod", "half a polynomial", lambda: built(counts=(7, 2.5, 64)), ("basis_size", "2.5")),
+    *(
+        Case("AbstractMethod", f"polynomials of degree {degree}", lambda degree=degree: js.discretize(js.circle(N), method=Method(degree=degree)), ("polynomial_degree of Method", *words))
+        for degree, words in ((0, ("0", "at least 1")), (2.5, ("2.5", "whole number")), ("two", ("'two'", "whole number")))
+    ),
     Case("AbstractMethod", "empty blocks", lambda: built(counts=(7, 3, 0)), ("batch_size", "0", "1")),
 ]  # fmt: skip

@@ -101,8 +101,7 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     instance(cloud, PointCloud, "cloud")
     instance(method, AbstractMethod, "method", "GFDM(degree=4) or DCPSE(order=2), say")
     if neighbors is not None:
-        instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
-        neighbors = switched_on(cloud, neighbors)
+        neighbors = switched_on(cloud, checked_lists(neighbors))
     weights = None
     if neighbors is None:
         neighbors, laplacian = _adapted(cloud, method, throw)
@@ -115,6 +114,13 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     if throw and is_concrete(stencil.weights):
         _check(stencil, neighbors, method, target, cloud.dim)
     return stencil
+
+
+def checked_lists(neighbors) -> Neighbors:
+    """Refuse what are no lists, as a method that is not given by name."""
+    named = isinstance(neighbors, AbstractMethod)
+    hint = "a method is given by name, method=..." if named else "see find_neighbors"
+    return instance(neighbors, Neighbors, "neighbors", hint)
 
 
 def _stencil(cloud, neighbors, values, diagnostics) -> Stencil:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .compiling import namespace
+from .failures import warn
 from .stencils.method import AbstractMethod, Diagnostics
 from .stencils.targets import Laplacian
 
@@ -116,3 +117,36 @@ def _spread(xp, offsets, mask, k: int):
 def residual_tolerance(dtype) -> float:
     """Largest relative moment residual of a stencil that counts as determined."""
     return float(jnp.finfo(dtype).eps) ** 0.5
+
+
+def report(cloud, neighbors, poor, best, chosen, method) -> None:
+    """Warn of points inside the surface where no size serves."""
+    failed = best < method.least_dominance
+    if cloud.boundary is not None:
+        failed &= ~np.asarray(cloud.boundary)[poor]
+    if failed.any():
+        worst = np.flatnonzero(failed)[np.argmin(best[failed])]
+        bare = _on_one_side(cloud, neighbors, poor[failed]) if cloud.boundary is None else 0
+        bare = bare if bare > _RIM * cloud.n ** (1 - 1 / (cloud.dim - 1)) else 0
+        advice = "; if the surface has a border, mark it (boundary=js.detect_boundary(cloud))"
+        aside = f". {bare} of them have neighbours on one side only{advice}" if bare else ""
+        warn(
+            f"for {failed.sum()} points no size of neighbourhood serves {method}: the worst is "
+            f"point {poor[worst]}, where the centre has a share of {best[worst]:.2g} of the "
+            f"weights among the {chosen[worst]} nearest, {method.least_dominance} is needed; the "
+            f"operator may have growing modes (js.spectral_estimate){aside}"
+        )
+
+
+# On half of a disk the mean of the points is 0.6 of their distances from its centre off it. Fewer
+# such points than this, in units of those across a surface, are folds.
+_ASIDE, _RIM = 0.45, 0.5
+
+
+def _on_one_side(cloud, neighbors, rows) -> int:
+    """How many of these points look as if they were on a border."""
+    points, mask = np.asarray(cloud.points), np.asarray(neighbors.mask)[rows][:, :, None]
+    offsets = mask * (points[np.asarray(neighbors.indices)[rows]] - points[rows][:, None])
+    mean = np.linalg.norm(offsets.sum(axis=1), axis=1) / mask.sum(axis=(1, 2))
+    squared = np.sum(offsets**2, axis=(1, 2)) / mask.sum(axis=(1, 2))
+    return int(np.sum(mean > _ASIDE * np.sqrt(squared)))

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .adapt import dominance, is_better, represented, share_wanted, sizes_to_try
+from .adapt import dominance, is_better, report, represented, share_wanted, sizes_to_try
 from .adapt import residual_tolerance as residual_tolerance
 from .arguments import as_many, instance, whole
 from .cloud import PointCloud
@@ -107,8 +107,7 @@ def build_all(cloud, neighbors, method, target, throw) -> list[Stencil]:
     instance(cloud, PointCloud, "cloud")
     instance(method, AbstractMethod, "method", "GFDM(degree=4) or DCPSE(order=2), say")
     if neighbors is not None:
-        instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
-        neighbors = switched_on(cloud, neighbors)
+        neighbors = switched_on(cloud, checked_lists(neighbors))
     weights = None
     if neighbors is None:
         neighbors, laplacian = _adapted(cloud, method, throw)
@@ -121,6 +120,13 @@ def build_all(cloud, neighbors, method, target, throw) -> list[Stencil]:
     if throw and is_concrete(stencils[0].weights):
         _check(stencils[0], neighbors, method, target, cloud.dim)
     return stencils
+
+
+def checked_lists(neighbors) -> Neighbors:
+    """Refuse what are no lists, as a method that is not given by name."""
+    named = isinstance(neighbors, AbstractMethod)
+    hint = "a method is given by name, method=..." if named else "see find_neighbors"
+    return instance(neighbors, Neighbors, "neighbors", hint)
 
 
 def _stencils(cloud, neighbors, values, diagnostics) -> list[Stencil]:
@@ -272,7 +278,7 @@ def _chosen(cloud, method, throw, needed, fewest):
     sizes, fewest = sizes_to_try(method, cloud.dim, k, available), k if fewest is None else fewest
     border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
     if not poor.size or not sizes:
-        _report(cloud, neighbors, poor, share[poor], np.full(poor.size, k), method)
+        report(cloud, neighbors, poor, share[poor], np.full(poor.size, k), method)
         return neighbors, found
 
     # Filled up with copies, so that few shapes are ever compiled.
@@ -294,7 +300,7 @@ def _chosen(cloud, method, throw, needed, fewest):
         chosen = np.where(better, size, chosen)
         news = some[0].T, some[1].T, *jax.tree.leaves(trial)
         kept = [np.where(better, new, old) for new, old in zip(news, kept)]
-    _report(cloud, neighbors, poor, best[: poor.size], chosen, method)
+    report(cloud, neighbors, poor, best[: poor.size], chosen, method)
 
     def put(old, new):
         full = np.array(old)
@@ -316,39 +322,6 @@ def _in_chunks(cloud, indices, mask, method, rows):
         some = Rows(indices[part], mask[part])
         parts.append(stencil_weights(cloud, some, method, Laplacian(), rows[part]))
     return jax.tree.map(lambda *a: np.concatenate([np.asarray(b) for b in a], axis=-1), *parts)
-
-
-def _report(cloud, neighbors, poor, best, chosen, method) -> None:
-    """Warn of points inside the surface where no size serves."""
-    failed = best < method.least_dominance
-    if cloud.boundary is not None:
-        failed &= ~np.asarray(cloud.boundary)[poor]
-    if failed.any():
-        worst = np.flatnonzero(failed)[np.argmin(best[failed])]
-        bare = _on_one_side(cloud, neighbors, poor[failed]) if cloud.boundary is None else 0
-        bare = bare if bare > _RIM * cloud.n ** (1 - 1 / (cloud.dim - 1)) else 0
-        advice = "; if the surface has a border, mark it (boundary=js.detect_boundary(cloud))"
-        aside = f". {bare} of them have neighbours on one side only{advice}" if bare else ""
-        warn(
-            f"for {failed.sum()} points no size of neighbourhood serves {method}: the worst is "
-            f"point {poor[worst]}, where the centre has a share of {best[worst]:.2g} of the "
-            f"weights among the {chosen[worst]} nearest, {method.least_dominance} is needed; the "
-            f"operator may have growing modes (js.spectral_estimate){aside}"
-        )
-
-
-# On half of a disk the mean of the points is 0.6 of their distances from its centre off it. Fewer
-# such points than this, in units of those across a surface, are folds.
-_ASIDE, _RIM = 0.45, 0.5
-
-
-def _on_one_side(cloud, neighbors, rows) -> int:
-    """How many of these points look as if they were on a border."""
-    points, mask = np.asarray(cloud.points), np.asarray(neighbors.mask)[rows][:, :, None]
-    offsets = mask * (points[np.asarray(neighbors.indices)[rows]] - points[rows][:, None])
-    mean = np.linalg.norm(offsets.sum(axis=1), axis=1) / mask.sum(axis=(1, 2))
-    squared = np.sum(offsets**2, axis=(1, 2)) / mask.sum(axis=(1, 2))
-    return int(np.sum(mean > _ASIDE * np.sqrt(squared)))
 
 
 # --- checks --------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from . import curvature, operators, quadrature
 from .arguments import as_float, as_many, finite, instance, switched_off, whole
 from .borders.border import Border
 from .borders.order import marked_border
-from .build import choose_neighbors
+from .build import checked_lists, choose_neighbors
 from .cloud import PointCloud
 from .failures import is_concrete, needs_values, without_derivatives
 from .interpolation import interpolated
@@ -396,5 +396,5 @@ def discretize(
     instance(method, AbstractMethod, "method", "GFDM(degree=4) or DCPSE(order=2), say")
     if neighbors is None:
         neighbors = choose_neighbors(cloud, method=method)
-    instance(neighbors, Neighbors, "neighbors", "see find_neighbors")
-    return Discretization(cloud, switched_on(cloud, neighbors), method, marked_border(cloud))
+    neighbors = switched_on(cloud, checked_lists(neighbors))
+    return Discretization(cloud, neighbors, method, marked_border(cloud))

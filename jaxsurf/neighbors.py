@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .arguments import POINTS, as_float, finite, is_array, real, shaped, whole
+from .arguments import POINTS, as_float, finite, instance, is_array, real, shaped, whole
 from .checks import check_count, check_orientation, check_overlap, check_spacing, two_sheets
 from .cloud import PointCloud
 from .compiling import on_device
@@ -192,6 +192,8 @@ def find_neighbors(
     real(min_cosine, "min_cosine", least=-1, most=1)
     surface = isinstance(cloud, PointCloud)
     if not isinstance(cloud, PointCloud):
+        if hasattr(cloud, "cloud"):  # a surface
+            instance(cloud, PointCloud, "cloud")
         flat = shaped(as_float(cloud, "cloud"), "points", *POINTS)
         cloud = PointCloud(flat, jnp.zeros_like(flat).at[:, 0].set(1))
     on = cloud.host_active

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .arguments import instance, whole
+from .arguments import whole
 from .failures import needs_values, raise_at, warn
 from .stencils.algebra import AbstractOperator, Composition, check_scalar
 
@@ -77,7 +77,6 @@ def spectral_estimate(operator: AbstractOperator, *, steps: int = 40, degree: in
         >>> bool(spectrum.abscissa < 1e-9 * spectrum.radius)
         True
     """
-    instance(operator, AbstractOperator, "operator")
     check_scalar(operator)
     steps, degree = whole(steps, "steps", least=8), whole(degree, "degree", least=1)
     needs_values("operator", operator, instead="spectra are estimated outside jit and grad")

@@ -112,6 +112,17 @@ def test_a_surface_in_place_of_its_cloud():
     for function in (js.laplace_beltrami, js.mean_curvature, js.sort_cloud, js.discretize):
         with pytest.raises(TypeError, match=r"Discretization, expected .*: its \.cloud is one"):
             function(surface)
+    with pytest.raises(TypeError, match=r"cloud is a Discretization, .*: its \.cloud is one"):
+        js.find_neighbors(surface, k=9)
+    for solves in (lambda: js.solve(surface, jnp.ones(300)), lambda: js.spectral_estimate(surface)):
+        with pytest.raises(TypeError, match=r"operator is a Disc.*: surface\.laplacian is one"):
+            solves()
+
+
+@pytest.mark.parametrize("function", [js.laplace_beltrami, js.discretize])
+def test_a_method_in_place_of_neighbors(function):
+    with pytest.raises(TypeError, match=r"neighbors is GFDM.*: a method is given by name"):
+        function(SPHERE, js.GFDM(degree=2))
 
 
 def test_functions_of_one_point_that_are_written_for_many():

@@ -226,6 +226,17 @@ def test_single_precision():
     np.testing.assert_allclose(modes.values, js.eigenmodes(operator, 4).values, atol=1e-3)
 
 
+def test_multigrid_takes_a_right_hand_side_without_imaginary_part(monkeypatch):
+    """Its relative residual was no number, and an error."""
+    pytest.importorskip("pyamg")
+    monkeypatch.setattr(inverse, "_FACTORISED", 100)
+    z = np.asarray(js.sphere(500).points[:, 2])
+    operator = js.laplace_beltrami(js.sphere(500), method=js.GFDM(degree=2))
+    inverted = inverse.Inverse(-operator.to_scipy().tocsr(), shift=-1.0)
+    np.testing.assert_array_equal(inverted(z + 0j), inverted(z))
+    np.testing.assert_allclose(inverted(z), z / 3, atol=0.02)
+
+
 def test_multigrid_gives_the_same(monkeypatch):
     pytest.importorskip("pyamg")
     operator = laplacian(500, 2)

@@ -10,6 +10,7 @@ import pytest
 
 import jaxsurf as js
 from jaxsurf.moving import follow
+from jaxsurf.moving.eversion import told_extinction
 from jaxsurf.moving.problem import Moving
 
 from .helpers import count_compilations
@@ -387,6 +388,15 @@ def test_the_volume_is_told_of_closed_surfaces_wherever_they_are():
     angles = jnp.linspace(0, jnp.pi, 40)
     arc = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
     assert np.isnan(told(js.PointCloud(arc, arc, boundary=np.arange(40) % 39 == 0)))
+
+
+def test_a_surface_that_shrinks_to_nothing_is_told():
+    """By the error of a flow that goes on past that; not of one that stops for another reason."""
+    stopped = lambda x: js.IntegrationError("stopped", None, 0.5, (x,))
+    vanished = told_extinction(SURFACE, stopped(3 + 2e-4 * CLOUD.points))
+    assert "stopped. The surface has shrunk to 0.0002 of its size: it vanishes" in str(vanished)
+    assert vanished.time == 0.5
+    assert str(told_extinction(SURFACE, stopped(0.3 * CLOUD.points))) == "stopped"
 
 
 def test_a_surface_that_is_turned_inside_out_is_told():

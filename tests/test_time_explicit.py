@@ -168,6 +168,23 @@ def test_derivatives(reach):
     np.testing.assert_allclose(float(forward), reverse, rtol=1e-10)
 
 
+def test_derivatives_of_a_bounded_loop():
+    """They were NaN in reverse: a length that is zero at the start of the stages was among them."""
+    z = CLOUD.points[:, 2]
+    dt = 2 / RADIUS
+
+    def size(factor, loop, adjoint):
+        how = dict(saveat=dfx.SaveAt(t1=True), adjoint=adjoint, max_steps=3)
+        term = dfx.ODETerm(lambda t, u, args: LAPLACIAN(u))
+        solver = js.RKC2(1.5 * RADIUS, max_stages=4, loop=loop)
+        u = dfx.diffeqsolve(term, solver, 0.0, 2 * dt, dt, factor * z, **how).ys[-1]
+        return jnp.sum(u**2)
+
+    usual = jax.grad(size)(1.0, "checkpointed", dfx.RecursiveCheckpointAdjoint())
+    found = jax.grad(size)(1.0, "bounded", dfx.DirectAdjoint())
+    np.testing.assert_allclose(found, usual, rtol=1e-12)
+
+
 def test_states_of_several_parts_and_batches():
     u0 = jnp.exp(CLOUD.points[:, 2])
     term = dfx.ODETerm(lambda t, y, args: (LAPLACIAN(y[0]), LAPLACIAN(y[1])))

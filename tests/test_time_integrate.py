@@ -174,6 +174,13 @@ def test_derivatives_in_start_and_end_where_solutions_may_grow():
 # --- failures ------------------------------------------------------------------------------
 
 
+def test_forward_mode_by_an_adjoint_that_has_none():
+    problem = js.AdvectionDiffusionReaction(LAPLACIAN)
+    end = lambda factor: js.integrate(problem, factor * Z, t1=0.1).ys[-1]
+    with pytest.raises(TypeError, match=r"reverse mode only: .* adjoint=diffrax.ForwardMode\(\)"):
+        jax.jacfwd(end)(1.0)
+
+
 def test_explosion_keeps_the_last_good_state():
     """u' = u² from 1 explodes at t = 1."""
     problem = js.AdvectionDiffusionReaction(LAPLACIAN, reaction=lambda t, u, args: u**2)

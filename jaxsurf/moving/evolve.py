@@ -25,12 +25,12 @@ from ..stencils.usual import USUAL
 from ..time.asked import check_coefficients
 from ..time.checkpoint import Checkpoint
 from ..time.higher import WaveEquation
-from ..time.integrate import integrate
+from ..time.integrate import IntegrationError, integrate
 from ..time.problem import AbstractEvolution, checked_problem
 from ..time.states import tell_small
 from .adaptation import Adaptation, checked_adaptation
 from .contact import Contact, checked_contact
-from .eversion import tell_eversion
+from .eversion import tell_eversion, told_extinction
 from .follow import ClosesOverTraced, followed
 from .motions import AbstractMotion, checked_motion
 from .problem import Moving, joined, parted
@@ -250,6 +250,8 @@ def evolve(
             return found
         except ClosesOverTraced:
             _refuse_looks(looked)
+        except IntegrationError as error:
+            raise (error if looked["adapt"] else told_extinction(surface, error)) from None
     return _kept(moving, state, t0, times, options)
 
 

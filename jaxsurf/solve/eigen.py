@@ -106,7 +106,6 @@ def eigenmodes(
         >>> bool(jnp.allclose(modes.values, jnp.array([0.0, 2.0, 2.0, 2.0]), atol=0.01))
         True
     """
-    instance(operator, AbstractOperator, "operator", "js.laplace_beltrami(cloud) makes one")
     check_scalar(operator)
     if closure is not None:
         instance(closure, Closure, "closure", "js.eliminate(cloud, conditions) makes one")

@@ -57,6 +57,8 @@ class Inverse:
         return other
 
     def _iterate(self, b: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        if not b.any():  # one part of a complex right-hand side
+            return np.zeros_like(b)
         x, _ = bicgstab(self._matrix, b, rtol=self._rtol, M=self._multigrid, maxiter=300)
         reached = np.linalg.norm(self._matrix @ x - b) / np.linalg.norm(b)
         if not reached < 100 * self._rtol:

@@ -22,7 +22,6 @@ _NEAR, _FAR = 8, 1e-3
 
 def check_kinds(operator, closure) -> None:
     """Refuse what is no operator on scalar fields, and what is no closure for it."""
-    instance(operator, AbstractOperator, "operator", "js.laplace_beltrami(cloud) makes one")
     check_scalar(operator)
     if closure is not None:
         hint = "js.eliminate(cloud, conditions) makes one"

@@ -385,7 +385,9 @@ class Transposed(AbstractOperator):
 
 
 def check_scalar(operator: AbstractOperator) -> None:
-    """Refuse operators with components."""
+    """Refuse what is no operator, and operators with components."""
+    hint = "surface.laplacian is one, js.laplace_beltrami(cloud) makes one"
+    instance(operator, AbstractOperator, "operator", hint)
     if operator.in_shape or operator.out_shape:
         shapes = f"{operator.in_shape} to {operator.out_shape}"
         raise ValueError(f"an operator on scalar fields is needed, not from {shapes} components")

@@ -179,8 +179,9 @@ class Step(eqx.Module):
             rate: for those, the rate at the start and a direction added to it.
         """
         rows = jnp.asarray(table(self.max_stages), dtype_of(self.y0))[jnp.where(power, 0, count)]
-        size = small(self.y0)
-        away = lambda rate: length(jax.tree.map(jnp.subtract, rate, self.rate0))
+        # Constants, as the radius: at the start one is zero, where a length has no derivative.
+        size = small(constant(self.y0))
+        away = lambda rate: length(constant(jax.tree.map(jnp.subtract, rate, self.rate0)))
 
         def turn(carry):
             j, last, before, rate, stretched = carry

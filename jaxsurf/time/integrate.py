@@ -108,7 +108,7 @@ def integrate(
     the steps taken: how the controller chose them is not differentiated.
     Raises:
         TypeError: arguments of another kind; functions not made of operations of JAX; a state of
-            another precision than its rate.
+            another precision than its rate; a derivative in forward mode without `ForwardMode`.
         ValueError: a state that is not finite, or for which the right-hand side is not; steps of
             given length that are explicit, in part or whole, beyond the limit of stability (with
             step, limit and spectral radius; of a rate that depends on time at six times); diffusion
@@ -182,7 +182,7 @@ class _Steady(eqx.Module):
 
 def _finished(plan: Plan, run: Run, throw: bool) -> dfx.Solution:
     """The solution as asked for; an error with the last good state if it ended early."""
-    solution, verdict = solve(run)
+    solution, verdict = _solved(run)
     assert solution.ts is not None and solution.ys is not None
     (ts, (t_last,)), (ys, last) = solution.ts, solution.ys
     stats = dict(solution.stats)
@@ -212,6 +212,20 @@ def _finished(plan: Plan, run: Run, throw: bool) -> dfx.Solution:
         return solution
     t, state = float(t_last), jax.tree.map(lambda leaf: leaf[-1], last)
     raise IntegrationError(_reason(plan, run, solution, t, state), solution, t, state)
+
+
+def _solved(run: Run) -> tuple[dfx.Solution, Verdict | None]:
+    """As `solve`; a derivative that the adjoint does not have is refused in words."""
+    try:
+        return solve(run)
+    except TypeError as error:
+        if "forward-mode autodiff" not in str(error):  # JAX has no class of its own for it
+            raise
+        raise TypeError(
+            f"adjoint={type(run.adjoint).__name__} has derivatives in reverse mode only: for "
+            "forward mode (jvp, jacfwd) pass adjoint=diffrax.ForwardMode(), for one over the other "
+            "(jax.hessian) diffrax.DirectAdjoint() with a small max_steps"
+        ) from error
 
 
 def _summary(plan: Plan, solution: dfx.Solution, t: float) -> str:

@@ -136,4 +136,7 @@ def _nearest(points, neighbors: Neighbors) -> Float[Array, " n"]:
     squares = jnp.sum(offsets**2, axis=-1)
     other = neighbors.mask & (neighbors.indices != jnp.arange(len(points))[:, None])
     # The largest where there is no other, so that nothing is divided by zero on the way back.
-    return jnp.sqrt(jnp.min(jnp.where(other, squares, jnp.max(squares)), axis=1))
+    squares = jnp.where(other, squares, jax.lax.stop_gradient(jnp.max(squares)))
+    # By its place: a derivative of the least asks which of numbers computed anew are equal to it.
+    least = jnp.argmin(squares, axis=1)[:, None]
+    return jnp.sqrt(jnp.take_along_axis(squares, least, axis=1)[:, 0])

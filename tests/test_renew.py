@@ -197,6 +197,27 @@ def test_what_has_no_room_or_is_out_of_reach_has_a_code():
     assert code(call(cloud.points.at[3].set(jnp.nan), normals))[3] == 1
 
 
+def test_what_finds_no_wider_list_keeps_that_of_before_and_its_stencil():
+    """Where the usual list, found before that, does not serve it."""
+    rough = random_sphere(900)
+    before = js.discretize(rough, js.find_neighbors(rough, 36), method=METHOD)
+    search = before.search(margin=2)
+    *others, wide = search.tiers
+    cramped = dataclasses.replace(search, tiers=(*others, wide._replace(candidates=wide.k)))
+    there = carried(lambda x: smooth(x, 2, 0.15), rough)
+    moved, laplacian, code = found(before, there, cramped)
+    kept = np.asarray(code) == 5
+    assert 10 < kept.sum() < 300
+    old = np.asarray(before.neighbors.indices)
+    np.testing.assert_array_equal(np.asarray(moved.neighbors.indices)[kept][:, :36], old[kept])
+    usual = np.asarray(js.find_neighbors(there, 36).indices)
+    assert np.mean(np.any(np.sort(usual) != np.sort(old), axis=1)[kept]) > 0.5
+    stencil = js.laplace_beltrami(there, moved.neighbors, method=METHOD, throw=False)
+    np.testing.assert_allclose(
+        laplacian.weights, stencil.weights, atol=1e-9 * np.abs(stencil.weights).max()
+    )
+
+
 def test_kept_lists_reach_as_long_as_the_surface_is_not_stretched_one_way():
     cloud = js.sphere(600)
     surface = js.discretize(cloud, method=METHOD)

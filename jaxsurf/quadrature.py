@@ -64,7 +64,7 @@ class Cut(eqx.Module):
     sides: int = eqx.field(static=True)
 
     def __call__(self, around: Neighborhood, line: Float[Array, "d *p"] | None = None) -> Cells:
-        """Args: the line is the border where the surface ends, by its conormal, elsewhere zero."""
+        """Of a block; its line is the conormal where the surface ends, zero elsewhere."""
         plane, graph = Graph.of(around, self.degree)
         on = around.mask[0]
         sides = Sides.of(plane, around.mask, self.sides, line)

@@ -206,8 +206,10 @@ class Stencil(AbstractOperator):
         """Read what `save` wrote.
 
         Raises:
+            TypeError: a path that is none.
             ValueError: the file is not such an archive.
         """
+        instance(path, (str, os.PathLike), "path")
         try:
             with np.load(path, allow_pickle=False) as archive:
                 data = {name: archive[name] for name in archive.files}

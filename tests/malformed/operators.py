@@ -348,6 +348,7 @@ CASES = [
     *[Case("find_neighbors", *case) for case in FIND],
     *[Case("Stencil", *case) for case in STENCIL],
     Case("Stencil", "saved under a number", lambda: ring().save(3), ("path is 3", "str")),
+    Case("Stencil", "loaded from nothing", lambda: js.Stencil.load(None), ("path is None", "str")),
     Case(
         "Stencil",
         "its own points twice, in NumPy",

@@ -83,6 +83,15 @@ class Method(js.AbstractMethod):
         return self.change(js.GFDM(degree=2).weights(neighborhood, target))
 
 
+class Sharing(Method):
+    shares_moments = True
+
+
+def only_the_first(found):
+    first = found[0][0] if isinstance(found[0], tuple) else found[0]
+    return first, found[1]
+
+
 class Motion(js.AbstractMotion):
     how: object = eqx.field(static=True)
 
@@ -175,6 +184,7 @@ CASES = [
     Case("AbstractMotion", "text", lambda: moved(lambda x: "fast"), ("velocity of Motion",)),
     Case("AbstractMethod", "weights of too few slots", lambda: built(change=lambda found: (found[0][..., 1:, :], found[1])), ("weights of Method", "(6, 64)", "7, 64")),
     Case("AbstractMethod", "weights without diagnostics", lambda: built(change=lambda found: found[0]), ("weights of Method", "Diagnostics")),
+    Case("AbstractMethod", "one operator of two", lambda: js.discretize(js.circle(N), method=Sharing(only_the_first)).laplacian, ("weights of Sharing", "2 arrays", "target.assemble")),
     Case("AbstractMethod", "no neighbours", lambda: built(counts=(0, 3, 64)), ("neighbor_count", "0", "1")),
     Case("AbstractMethod", "half a polynomial", lambda: built(counts=(7, 2.5, 64)), ("basis_size", "2.5")),
     *(

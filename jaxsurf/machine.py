@@ -44,6 +44,8 @@ class Machine(NamedTuple):
         gathered: weights of a scalar operator below which everything is gathered at once, without
             a loop.
         unknowns: of small systems up to which straight-line code runs faster than a library.
+        monomials: of products with a basis up to which these are straight-line code, whatever the
+            form of the systems.
         columns: unknowns up to which these are factored in loops over columns.
         quick: numbers given to a program, in all its arrays, below which it is compiled quickly.
         divides: whether programs are divided among its cores.
@@ -56,6 +58,7 @@ class Machine(NamedTuple):
     slots: int
     gathered: int
     unknowns: int
+    monomials: int
     columns: int
     quick: int
     divides: bool
@@ -69,6 +72,7 @@ CPU = Machine(
     slots=10,
     gathered=50_000,
     unknowns=15,
+    monomials=60,
     columns=120,
     quick=1_750_000,
     divides=True,
@@ -81,6 +85,7 @@ ACCELERATOR = Machine(
     slots=1_000,
     gathered=1 << 40,
     unknowns=15,
+    monomials=0,
     columns=15,
     quick=0,
     divides=False,

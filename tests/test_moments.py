@@ -22,10 +22,10 @@ from jaxsurf.fits.monomials import (
     multi_indices,
 )
 from jaxsurf.fits.polygon import _root
-from jaxsurf.fits.sums import spread, sums
+from jaxsurf.fits.sums import spread, sums, total
 from jaxsurf.stencils.targets import Gradient, Hessian, Laplacian, Partial
 
-from .helpers import check_derivative
+from .helpers import check_derivative, operations
 
 
 def _plain_sums(rows, axis):
@@ -77,6 +77,37 @@ def test_sums_are_one_reduction(transposed):
     program = jax.jit(f).lower(jnp.ones((40, 5))).compile().as_text()
     assert program.count(" reduce(") == 1
     assert " reduce-window(" not in program
+
+
+@pytest.mark.parametrize("count", [1, 32, 33, 66, 100])
+def test_a_sum_in_parts(count):
+    """Over either axis, of what is true too, its derivative, and as one program."""
+    a = jnp.asarray(np.random.default_rng(count).normal(size=(count, 7)))
+    np.testing.assert_allclose(total(a), a.sum(axis=0), rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(total(a.T, axis=1), a.sum(axis=0), rtol=1e-13, atol=1e-13)
+    np.testing.assert_array_equal(total(a > 0), (a > 0).sum(axis=0))
+    slope = jax.grad(lambda a: jnp.sum(total(a**2) ** 2))(a)
+    np.testing.assert_allclose(slope, 4 * a * jnp.sum(a**2, axis=0), rtol=1e-12)
+    program = jax.jit(lambda a, b: total(a * b)).lower(a, a).compile().as_text()
+    assert jax.default_backend() != "cpu" or " reduce-window(" not in program
+
+
+@pytest.mark.parametrize("high", [3, 4, 5])
+def test_gradients_store_nothing_that_hangs_on_numbers_alone(high):
+    """Loops over columns stay in one piece: no index and no mask of columns is kept for each."""
+    rng = np.random.default_rng(0)
+    x, w = (jnp.asarray(rng.uniform(size=s)) for s in ((2, 3, 40, 4), (2, 40, 4)))
+    b = jnp.ones((len(multi_indices(3, 1, high)), 1))
+
+    def f(x, w):
+        block = lambda part: moment_solve(part[0], part[1], b, 1, high)[0]
+        return jnp.sum(blockwise(block, (x, w)) ** 2)
+
+    program = jax.make_jaxpr(jax.grad(f, (0, 1)))(x, w)
+    loops = [e for e in operations(program.jaxpr) if e.primitive.name == "scan"]
+    assert len(loops) > 5
+    stored = [v.aval.dtype for e in loops for v in e.outvars[e.params["num_carry"] :]]
+    assert {a.kind for a in stored} == {"f"}
 
 
 @pytest.mark.parametrize("dim, high", [(1, 4), (2, 5), (3, 6)])

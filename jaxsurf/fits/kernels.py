@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..compiling import kept
+from .sums import total
 
 
 def taper(s: Float[Array, "*q"]) -> Float[Array, "*q"]:
@@ -62,7 +63,7 @@ def support(
     Differentiable: forward and reverse; the root by the implicit function theorem.
     """
     if radius is None:
-        target = _SHARE * _MEAN_WEIGHT[dim] * jnp.sum(mask, axis=0)
+        target = _SHARE * _MEAN_WEIGHT[dim] * total(mask)
         return _soft_radius(r2, mask, jnp.maximum(target, 1.2), dim)
     return jnp.broadcast_to(jnp.asarray(radius, r2.dtype), r2.shape[1:])
 
@@ -93,7 +94,7 @@ def _log_radius(r2, mask, target):
 
     # A disc that is filled evenly out to the radius R has a mean r^2 of R^2 / 2, a ball of any
     # dimension about that; the share of the list that is wanted takes part of it.
-    mean = jnp.sum(jnp.where(mask, r2, 0), axis=0) / jnp.sum(mask, axis=0)
+    mean = total(jnp.where(mask, r2, 0)) / total(mask)
     start = 0.5 * jnp.log(jnp.where(mean > 0, 2 * _SHARE * mean, 1))
     infinite = jnp.asarray(jnp.inf, r2.dtype)
     t = jax.lax.while_loop(moving, newton, (start - 5, start + 5, start, infinite, 0))[2]
@@ -109,15 +110,15 @@ def _log_radius_jvp(primals, tangents):
     _, slope = _counted(r2, mask, t)
     unit = jnp.exp(-2 * t)
     s = jnp.minimum(r2 * unit, 1)
-    lost = jnp.sum(jnp.where(mask, 3 * (1 - s) ** 2 * tangents[0], 0), axis=0) * unit
+    lost = total(jnp.where(mask, 3 * (1 - s) ** 2 * tangents[0], 0)) * unit
     return t, lost / jnp.maximum(slope, 1e-3)
 
 
 def _counted(r2, mask, t):
     """The weights $(1 - s)^3$ of all points, $s = r^2 / e^{2t}$, and their derivative in t."""
     s = jnp.minimum(r2 * jnp.exp(-2 * t), 1)
-    count = jnp.sum(jnp.where(mask, (1 - s) ** 3, 0), axis=0)
-    return count, jnp.sum(jnp.where(mask, 6 * s * (1 - s) ** 2, 0), axis=0)
+    count = total(jnp.where(mask, (1 - s) ** 3, 0))
+    return count, total(jnp.where(mask, 6 * s * (1 - s) ** 2, 0))
 
 
 def enclosing(r2: Float[Array, "k *p"], mask: Bool[Array, "k *p"]) -> Float[Array, "*p"]:

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..compiling import is_quick
+from ..compiling import is_quick, kept, stored
 from . import systems
-from .moments import add_moved_moments, gram_matrix, moved
-from .monomials import monomials, multi_indices
+from .moments import add_moved_moments, all_moments, arranged, columns, moved
+from .monomials import monomial_rows, monomials, multi_indices, polynomial_count
 
 # Least cosine between a line and the last axis. Flatter ones have slopes whose powers cancel.
 _STEEP = 0.7
@@ -77,18 +77,11 @@ def _places(dim: int, high: int) -> dict[tuple[int, ...], int]:
     }
 
 
-@functools.cache
-def _gather_table(dim: int, low: int, high: int) -> np.ndarray:
-    """Where the moment of multi-index beta + gamma stands."""
-    basis, place = multi_indices(dim, low, high), _places(dim, 2 * high)
-    total = (basis[:, None] + basis).tolist()
-    return np.array([[place[tuple(g)] for g in row] for row in total], np.int32)
-
-
-def _gram(x, w, low, high):
-    """The moments of all lines together, as a matrix."""
+def _moments(x, w, high):
+    """The moments of all lines together, up to twice the degree, graded."""
     sums = jnp.concatenate([jnp.sum(group, axis=1) for group in functionals(x, w, 2 * high)])
-    return sums[_gather_table(len(x), low, high)]
+    places = _places(len(x), 2 * high)
+    return sums[np.array([places[tuple(g)] for g in multi_indices(len(x), 0, 2 * high).tolist()])]
 
 
 def _weights(a, x, w, low, high):
@@ -135,12 +128,11 @@ def _solve(x, w, b, low, high):
         return jnp.sum(w * s.reshape(-1, *w.shape), axis=1)
 
     steep = not is_quick() and are_steep(x, w)
-    gram = _either(
-        steep, lambda: _gram(x, w, low, high), lambda: jnp.asarray(gram_matrix(*every, low, high))
-    )
+    found = _either(steep, lambda: _moments(x, w, high), lambda: all_moments(*every, high))
+    gram = arranged(kept(found), len(x), low, high)
     solve, condition = systems.factor(gram)
     b = b.astype(w.dtype).reshape(*b.shape, *(1,) * (w.ndim - 2))
-    a = solve(jnp.broadcast_to(b, (*b.shape[:2], *w.shape[2:])))
+    a = kept(solve(jnp.broadcast_to(b, (*b.shape[:2], *w.shape[2:]))))
     eta = _either(steep, lambda: _weights(a, x, w, low, high), lambda: pointwise(a))
     error = jnp.max(jnp.abs(systems.symmetric(gram, a) - b), axis=(0, 1))
     size = jnp.max(jnp.abs(b), axis=(0, 1))
@@ -156,8 +148,13 @@ def _line_solve_jvp(low, high, primals, tangents):
     shape = w.shape
     x, dx, w, dw = _flat(x), _flat(dx), w.reshape(-1, *shape[2:]), dw.reshape(-1, *shape[2:])
     start = len(multi_indices(len(x), 0, low - 1))
-    v = jax.lax.optimization_barrier(monomials(x, high))
-    s = systems.combine(a, v[start:])
+    v: list[Array] | Array
+    if x.ndim > 2 and systems.is_written_out(polynomial_count(len(x), high)):
+        v, a = monomial_rows(x, high), systems.entries(a)
+    else:
+        v = stored(monomials(x, high), w[(0,) * w.ndim] < 0)
+    dx = columns(dx, v, w)
+    s = systems.found_once(systems.combine(a, v[start:]), v, w)
     g = dw * s + w * moved(a, v, dx, start, high)
     rhs = add_moved_moments(systems.moments(v[start:], g), w * s, v, dx, start, high)
     d_eta = g - w * systems.combine(solve(rhs), v[start:])

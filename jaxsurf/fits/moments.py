@@ -135,7 +135,7 @@ def _moment_solve_jvp(low, high, primals, tangents):
     x, w, b = primals
     dx, dw, db = tangents
     (eta, condition, residual), (v, start, solve, a, s) = _solve(x, w, b, low, high)
-    dx = _columns(dx, v, w)
+    dx = columns(dx, v, w)
     s = systems.found_once(s, v, w)
     g = dw * s + w * moved(a, v, dx, start, high)
     rhs = add_moved_moments(systems.moments(v[start:], g), eta, v, dx, start, high)
@@ -192,7 +192,7 @@ def _polynomial_fit_jvp(low, high, primals, tangents):
     x, w, values = primals
     dx, dw, dz = tangents
     (out, condition), (v, start, solve) = _fit(x, w, values, low, high)
-    dx = _columns(dx, v, w)
+    dx = columns(dx, v, w)
     a = systems.entries(out) if isinstance(v, list) else out
     left = values - systems.combine(a, v[start:])
     g = dw * left + w * (dz - moved(a, v, dx, start, high))
@@ -201,7 +201,7 @@ def _polynomial_fit_jvp(low, high, primals, tangents):
     return (out, condition), (da, jnp.zeros_like(condition))
 
 
-def _columns(dx, v, w):
+def columns(dx, v, w):
     """Coordinates one by one: as slices each would have a derivative as large as all of them."""
     if not isinstance(v, list):
         return dx
@@ -247,35 +247,31 @@ def _table(dim: int, low: int, high: int) -> np.ndarray:
     return np.array([[place[tuple(g)] for g in row] for row in total], np.int32)
 
 
-@functools.cache
-def _gather_table(dim: int, low: int, high: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where the moment of multi-index beta + gamma stands: first coordinates, last coordinate.
-
-    Of 32 bits: arrays of 64 that live on keep in JAX the type of their first use, and then fail
-    after `enable_x64` has changed.
-    """
-    basis = multi_indices(dim, low, high)
-    total = basis[:, None] + basis[None]
-    place = position(dim - 1, 2 * high) if dim > 1 else {(): 0}
-    rows = np.array([[place[tuple(g[:-1])] for g in row] for row in total.tolist()])
-    return rows.astype(np.int32), total[..., -1].astype(np.int32)
-
-
 def gram_matrix(x, w, low, high):
     """The matrix A, each moment summed once."""
-    if _is_small(x, low, high):
-        each = sums(monomial_rows(x, 2 * high, w), 0)
-        return jnp.stack(each)[_table(len(x), low, high)]
-    # Moments as one small matrix product: monomials in all coordinates but the last, times
-    # powers of the last.
+    small = _is_small(x, low, high)
+    found = jnp.stack(sums(monomial_rows(x, 2 * high, w), 0)) if small else all_moments(x, w, high)
+    return arranged(found, len(x), low, high)
+
+
+def all_moments(x, w, high):
+    """Moments of w up to twice the degree, graded: monomials in all coordinates but the last, times
+    powers of the last, as one small matrix product."""
     powers, xp = monomials(x[-1:], 2 * high), namespace(x)
     others = monomials(x[:-1], 2 * high) if len(x) > 1 else xp.ones_like(x)
     factors = others * w, powers
     if xp is jnp:
         # Fused with the product, monomials would be found again for each of its entries.
         factors = jax.lax.optimization_barrier(factors)
-    moments = xp.einsum("aq...,bq...->ab...", *factors)
-    return moments[_gather_table(len(x), low, high)]
+    table = xp.einsum("aq...,bq...->ab...", *factors)
+    graded = multi_indices(len(x), 0, 2 * high)
+    rows = position(len(x) - 1, 2 * high) if len(x) > 1 else {(): 0}
+    return table[np.array([rows[tuple(g)] for g in graded[:, :-1].tolist()]), graded[:, -1]]
+
+
+def arranged(moments, dim: int, low: int, high: int):
+    """The matrix of a system, from all moments."""
+    return moments[_table(dim, low, high)]
 
 
 def in_blocks(a: Shaped[Array, "*s n"], size: int) -> Shaped[Array, "blocks *s size"]:

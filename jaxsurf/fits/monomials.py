@@ -9,13 +9,18 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import operator
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..compiling import AnyArray, namespace
+
+# Powers that are no loop, whose derivative would be loops too.
+_WRITTEN_OUT = 6
 
 
 @functools.cache
@@ -53,16 +58,17 @@ def _parents(dim: int, high: int) -> tuple[tuple[int, int], ...]:
 
 
 def monomials(x: Float[AnyArray, "dim *q"], high: int) -> Float[AnyArray, "m *q"]:
-    """All monomials of degree 0 to `high`, one multiplication each, a degree at a time."""
-    dim, xp = len(x), namespace(x)
-    degrees = [xp.ones_like(x[:1])]
-    for degree in range(1, high + 1):
-        # Those that begin with x_a are x_a times the lower ones in x_a and the coordinates after
-        # it, which stand last.
-        lower = degrees[-1]
-        tails = [math.comb(degree - 1 + dim - 1 - a, dim - 1 - a) for a in range(dim)]
-        degrees.append(xp.concatenate([x[a] * lower[-t:] for a, t in enumerate(tails)]))
-    return xp.concatenate(degrees)
+    """All monomials of degree 0 to `high`: products of powers, taken from a table of these."""
+    table = _powers(x, high)
+    chosen = zip(multi_indices(len(x), 0, high).T, range(len(x)))
+    return functools.reduce(operator.mul, [table[power, axis] for power, axis in chosen])
+
+
+def _powers(x: Float[AnyArray, "dim *q"], high: int) -> Float[AnyArray, "m dim *q"]:
+    xp = namespace(x)
+    if xp is jnp and high > _WRITTEN_OUT:
+        return jax.lax.scan(lambda p, _: (p * x, p), jnp.ones_like(x), length=high + 1)[1]
+    return xp.stack(list(itertools.accumulate([xp.ones_like(x)] + high * [x], operator.mul)))
 
 
 def monomial_rows(

@@ -7,12 +7,26 @@ derivatives keep this form then: transposed by JAX each sum would be one by itse
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+
+# The most numbers that XLA sums in one program.
+_SHORT = 32
+
+
+def total(a: jax.Array, axis: int = 0) -> jax.Array:
+    """Sum over an axis; over a long one in parts, which are one program together.
+
+    For what is computed in few operations: those before it may be found again for each part.
+    """
+    count = a.shape[axis]
+    ends = [count * i // -(-count // _SHORT) for i in range(1, -(-count // _SHORT))]
+    return functools.reduce(jnp.add, [jnp.sum(part, axis) for part in jnp.split(a, ends, axis)])
 
 
 def sums(rows: Sequence[jax.Array], axis: int) -> list[jax.Array]:

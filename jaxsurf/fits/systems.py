@@ -12,6 +12,7 @@ Shapes: q points of a neighbourhood, c right-hand sides, m monomials, `*p` point
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 
 import jax
@@ -20,10 +21,10 @@ import numpy as np
 
 from ..compiling import is_quick, namespace, stored
 from ..machine import CPU, machine
-from .sums import spread, sums
+from .sums import spread, sums, total
 
-# Columns of a factor between two passes over the matrix.
-_TOGETHER = 8
+# Columns of a factor between two passes over the matrix, at most.
+_TOGETHER = 12
 # Monomials of a sum.
 _SUMMED = 32
 
@@ -31,6 +32,11 @@ _SUMMED = 32
 def is_small(unknowns: int) -> bool:
     """Whether a system of so many takes the form that runs faster, and is compiled more slowly."""
     return unknowns <= machine().unknowns and not is_quick()
+
+
+def is_written_out(monomials: int) -> bool:
+    """Whether products with so many monomials take that form, in systems of any size."""
+    return monomials <= machine().monomials and not is_quick()
 
 
 def entries(a) -> list[jax.Array]:
@@ -137,23 +143,23 @@ def _by_columns(a, shift):
 
     def substitute(b):
         def forward(i, y):
-            left = _at(b, i) - jnp.sum(_at(columns, i, 1)[:, None] * y, axis=0)
+            left = _at(b, i) - total(_at(columns, i, 1)[:, None] * y)
             return _put(y, left / _at(pivot, i), i)
 
         def backward(j, x):
             i = np.uint32(m - 1) - j
-            left = _at(y, i) - jnp.sum(_at(columns, i)[:, None] * x, axis=0)
+            left = _at(y, i) - total(_at(columns, i)[:, None] * x)
             return _put(x, left / _at(pivot, i), i)
 
-        y = _loop(m, forward, jnp.zeros_like(b))
-        return _loop(m, backward, jnp.zeros_like(b))
+        y = _loop(m, forward, jnp.zeros_like(b), b)
+        return _loop(m, backward, jnp.zeros_like(b), b)
 
     def times(x):
         rows = jnp.sum(columns[:, :, None] * x, axis=1)
         return jnp.sum(columns[:, :, None] * rows[:, None], axis=0) - shift * x
 
     def solution(_, b):
-        return jax.lax.fori_loop(0, 2, lambda _, x: substitute(b + shift * x), jnp.zeros_like(b))
+        return _loop(2, lambda _, x: substitute(b + shift * x), jnp.zeros_like(b), b)
 
     def solve(b, refined):
         if not refined:
@@ -170,8 +176,9 @@ def _cholesky(a, shift):
     ten seconds to compile. Then one pass over what is left of the matrix takes them out of it.
     """
     m, columns = len(a), jnp.zeros_like(a)
-    for start in range(0, m, _TOGETHER):
-        few = _eliminated(a[:_TOGETHER], shift)
+    together = math.ceil(m / math.ceil(m / _TOGETHER))
+    for start in range(0, m, together):
+        few = _eliminated(a[:together], shift)
         count = len(few)
         columns = jax.lax.dynamic_update_slice(columns, few, (start, start, *(0,) * (a.ndim - 2)))
         if start + count < m:
@@ -193,12 +200,21 @@ def _eliminated(rows, shift):
         column = jnp.where(places < j, 0, column * jax.lax.rsqrt(_at(column, j)))
         return _put(columns, column, j)
 
-    return _loop(count, eliminate, jnp.zeros_like(rows))
+    return _loop(count, eliminate, jnp.zeros_like(rows), rows)
 
 
-def _loop(count: int, body: Callable, start):
-    """`fori_loop` over numbers without a sign, which need no code for negative ones."""
-    return jax.lax.fori_loop(np.uint32(0), np.uint32(count), body, start)
+def _loop(count: int, body: Callable, start, data):
+    """`fori_loop` over numbers without a sign, which need no code for negative ones.
+
+    The first number hangs on the data, if for show: what hangs on numbers alone reverse mode takes
+    out of a loop, computes in a loop of its own and stores.
+    """
+    zero = (data[(0,) * data.ndim] < -jnp.inf).astype(np.uint32)
+
+    def step(state, _):
+        return (state[0] + np.uint32(1), body(*state)), None
+
+    return jax.lax.scan(step, (zero, start), length=count)[0][1]
 
 
 def _at(a, i, axis: int = 0):

@@ -93,7 +93,8 @@ class DCPSE(AbstractMethod):
             jnp.stack([dot(a, axis[None]) for axis in frame])
             for a in (neighborhood.offsets, neighborhood.normals)
         )
-        copies = jnp.stack([offsets + m * step * normals for m in range(-count, count + 1)], 1)
+        along = step * normals
+        copies = jnp.stack([offsets + m * along for m in range(-count, count + 1)], 1)
         # On the hollow side copies are nearer than their point, so the point itself has to fade
         # as it leaves the support.
         fade = jnp.where(neighborhood.mask, taper(neighborhood.squared / radius**2), 0)

@@ -13,6 +13,7 @@ from ..arguments import as_float, real, whole
 from ..fits.kernels import gaussian, taper
 from ..fits.monomials import polynomial_count
 from ..fits.plane import Neighborhood, dot
+from ..fits.sums import total
 from .targets import AbstractTarget, Joint, Laplacian
 
 
@@ -56,7 +57,7 @@ class Diagnostics(eqx.Module):
         return cls(
             condition,
             residual,
-            jnp.sum(inside, axis=0),
+            total(inside),
             support,
             jnp.full(support.shape, layers, jnp.int32),
             jnp.max(jnp.where(inside, _bend(around), 0), axis=0) * support,
@@ -163,7 +164,7 @@ def _calmed(method: AbstractMethod, around: Neighborhood, weights, support):
     There no polynomial is of use, and a few such rows give an operator growing modes. Weights of
     one sign are inaccurate, but let nothing grow. Also the share of the centre.
     """
-    others = jnp.sum(jnp.abs(weights[1:]), axis=0)
+    others = total(jnp.abs(weights[1:]))
     share = jnp.where(others > 0, -weights[0] / jnp.where(others > 0, others, 1), -jnp.inf)
     # Without a jump where neighbours enter the support.
     counted = jnp.where(around.mask, taper(around.squared / support**2), 0)
@@ -177,9 +178,9 @@ def power_mean(values: Float[Array, "k *p"], counted: Float[Array, "k *p"]) -> F
     """Nearly the largest, and no more than it; smooth also where several are the largest."""
     largest = jax.lax.stop_gradient(jnp.max(values, axis=0))
     unit = jnp.where(largest > 0, largest, 1)
-    total = jnp.sum(counted * (values / unit) ** _POWER, axis=0)
-    found = total > 0
-    mean = jnp.where(found, total, 1) / jnp.where(found, jnp.sum(counted, axis=0), 1)
+    powers = total(counted * (values / unit) ** _POWER)
+    found = powers > 0
+    mean = jnp.where(found, powers, 1) / jnp.where(found, total(counted), 1)
     return jnp.where(found, unit * mean ** (1 / _POWER), 0)
 
 
@@ -200,7 +201,7 @@ def _positive(around: Neighborhood, support) -> Float[Array, "k *p"]:
     """Multiples of a kernel that give the squared distance the Laplacian it has in the plane."""
     r2, flat = around.squared, around.offsets.shape[1] - 1
     kernel = gaussian(r2, _NEAR * support, support, around.mask)
-    second = jnp.sum(kernel * r2, axis=0)
+    second = total(kernel * r2)
     eta = 2 * flat * kernel / jnp.where(second > 0, second, 1)
     return with_center(eta[None])[0]
 
@@ -239,4 +240,4 @@ def needed_polynomials(degree: int, dim: int, target: AbstractTarget) -> int:
 
 def with_center(eta: Float[Array, "c k *p"]) -> Float[Array, "c k *p"]:
     """Weights that sum to zero: those of the neighbours as given, the centre's made up."""
-    return eta.at[:, 0].set(-jnp.sum(eta[:, 1:], axis=1))
+    return eta.at[:, 0].set(-total(eta[:, 1:], axis=1))

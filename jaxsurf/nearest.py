@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -19,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .cells import distance_key
 from .checks import stands_above
-from .compiling import power_of_two
+from .compiling import power_of_two, stored
 from .machine import SEARCHED, block, machine
 from .sheets import cosine_slack
 
@@ -73,8 +74,12 @@ class Grid(eqx.Module):
         ordered = [column[order] for column in given]
         return cls(width, jnp.cumsum(count), order, cells, ordered, given, on, wide)
 
-    def candidates(self, rows, reach: int, count: int):
-        """Where in the order the candidates of some rows stand, `(count, r)`, and their number."""
+    def candidates(self, rows, reach: int):
+        """Where in the order the candidates of some rows stand, `(s, r)` for slots `(s, 1)`.
+
+        Returns:
+            That as a function, and their number.
+        """
         far, last = reach * _FINE, self.wide * _FINE - 1
         *across, along = (cell[rows] for cell in self.cells)
         steps = np.array(list(itertools.product(range(-reach, reach + 1), repeat=len(across))))
@@ -90,11 +95,14 @@ class Grid(eqx.Module):
         # From a slot to the order: a shift that grows from run to run.
         shift = start - (ends - length)
         more = jnp.diff(shift, axis=0)
-        slot = jnp.arange(count, dtype=jnp.int32)[:, None]
-        place = slot + shift[0]
-        for end, step in zip(ends[:-1], more):
-            place = place + jnp.where(slot >= end, step, 0)
-        return place, ends[-1]
+
+        def stands_at(slot):
+            at = slot + shift[0]
+            for end, step in zip(ends[:-1], more):
+                at = at + jnp.where(slot >= end, step, 0)
+            return at
+
+        return stands_at, ends[-1]
 
 
 def _folded(cell, wide: int):
@@ -153,30 +161,41 @@ def nearest_in(
 
 def _nearest(grid, rows, k, reach, count, min_cosine, few) -> Nearest:
     d = len(grid.cells)
-    width = power_of_two(max(k, 2))
-    count = max(-(-count // width), 2) * width
-    place, candidates = grid.candidates(rows, reach, count)
-    take = lambda column: column.at[place].get(mode="clip")
-    j = take(grid.order)
+    stands_at, candidates = grid.candidates(rows, reach)
     own = [column[rows] for column in grid.given]
-    theirs = [take(column) for column in grid.ordered]
-    offset = [x - x0 for x, x0 in zip(theirs[:d], own[:d])]
-    squared = _dot(offset, offset)
-    key = distance_key(squared)
     limit = distance_key((reach * grid.width / _MARGIN) ** 2)
-    cosine = _dot(theirs[d:], own[d:])
-    real = jnp.arange(count, dtype=jnp.int32)[:, None] < candidates
-    near = key <= limit
+
+    def looked_at(slot):
+        """Keys to sort, and which candidates are near."""
+        place = stands_at(slot)
+        take = lambda column: column.at[place].get(mode="clip")
+        j = take(grid.order)
+        theirs = [take(column) for column in grid.ordered]
+        offset = [x - x0 for x, x0 in zip(theirs[:d], own[:d])]
+        squared = _dot(offset, offset)
+        key = distance_key(squared)
+        cosine = _dot(theirs[d:], own[d:])
+        real, near = slot < candidates, key <= limit
+        good = near & (cosine >= min_cosine - cosine_slack(squared.dtype))
+        good = (good | (j == rows)) & real
+        rise = [jnp.abs(_dot(offset, normal)) for normal in (own[d:], theirs[d:])]
+        above = stands_above(squared, cosine, jnp.minimum(*rise))
+        key = jnp.where(good, jnp.where(j == rows, -1, key), _last(key.dtype))
+        return _packed(key, 2 * j + above, len(grid.order)), near | ~real
+
+    slots = lambda count: jnp.arange(count, dtype=jnp.int32)[:, None]
     # Where all rows are searched this is not asked, and would cost as much as all the rest.
     every = candidates == jnp.sum(grid.on)
-    every = every & (jnp.all(near | ~real, axis=0) if few else False)
-    good = near & (cosine >= min_cosine - cosine_slack(squared.dtype))
-    good = (good | (j == rows)) & real
-    rise = [jnp.abs(_dot(offset, normal)) for normal in (own[d:], theirs[d:])]
-    above = stands_above(squared, cosine, jnp.minimum(*rise))
-    key = jnp.where(good, jnp.where(j == rows, -1, key), _last(key.dtype))
-    keys = _packed(key, 2 * j + above, len(grid.order))
-    keys = _sorted_few(keys, k) if few or machine().sorts else _smallest(keys, width, k)
+    if few or machine().sorts:
+        keys, seen = looked_at(slots(max(count, k)))
+        every = every & (jnp.all(seen, axis=0) if few else False)
+        keys = _sorted_few(keys, k)
+    else:
+        every = every & False
+        width = power_of_two(max(k, 2))
+        most = jnp.minimum(jnp.max(candidates), count)
+        keys = _smallest(lambda i: looked_at(i * width + slots(width))[0], width, most)
+        keys = [a[:k] for a in keys]
     key, low = _unpacked(keys)
     mask = key < _last(key.dtype)
     above = mask & (low & 1 > 0)
@@ -213,27 +232,32 @@ def _sorted_few(keys, k: int):
     return [a[:, :k].T for a in jax.lax.sort(keys, num_keys=len(keys))]
 
 
-def _smallest(keys, width: int, k: int):
-    """The k smallest along the first axis, in order, by Batcher's network of exchanges."""
+def _smallest(group: Callable, width: int, count):
+    """The smallest of `count` keys along the first axis, by Batcher's network of exchanges.
 
-    def ordered(keys):
+    Group by group, each put in order and merged into those that were the smallest before, for as
+    many groups as there are.
+
+    Args:
+        group: the keys of group i, so many as the width.
+    """
+
+    def put_in_order(keys):
         size = 2
         while size <= width:
             keys = _merged(keys, size)
             size *= 2
         return keys
 
-    # A loop over two groups or more: in one piece with what comes before, the compiler would find
-    # the keys again for every use of them.
-    parts = jax.lax.map(ordered, tuple(a.reshape(-1, width, *a.shape[1:]) for a in keys))
-    groups = [tuple(a[i] for a in parts) for i in range(len(parts[0]))]
-    while len(groups) > 1:
-        pairs = [
-            _merged(_exchanged(low, tuple(a[::-1] for a in high))[0], width, first=False)
-            for low, high in zip(groups[::2], groups[1::2])
-        ]
-        groups = pairs + (groups[-1:] if len(groups) % 2 else [])
-    return [a[:k] for a in groups[0]]
+    def more(i, best):
+        # In one piece with what comes before, the compiler would find keys again for every use.
+        apart = lambda keys: tuple(stored(a, count < 0) for a in keys)
+        keys = apart(put_in_order(apart(group(i))))
+        low = _exchanged(best, tuple(a[::-1] for a in keys))[0]
+        return _merged(low, width, first=False)
+
+    none = [jnp.full(a.shape, jnp.iinfo(a.dtype).max, a.dtype) for a in jax.eval_shape(group, 0)]
+    return jax.lax.fori_loop(0, -(-count // width), more, tuple(none))
 
 
 def _merged(keys, size: int, first: bool = True):

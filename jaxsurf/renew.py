@@ -129,7 +129,7 @@ class NeighborSearch(eqx.Module):
 def _candidates(grid, reach: int):
     rows = jnp.arange(len(grid.order), dtype=jnp.int32)
     return jax.lax.map(
-        lambda i: grid.candidates(i[None], reach, 1)[1][0], rows, batch_size=block(COUNTED)
+        lambda i: grid.candidates(i[None], reach)[1][0], rows, batch_size=block(COUNTED)
     )
 
 

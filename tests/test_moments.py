@@ -23,9 +23,10 @@ from jaxsurf.fits.monomials import (
 )
 from jaxsurf.fits.polygon import _root
 from jaxsurf.fits.sums import spread, sums, total
+from jaxsurf.stencils.method import power_mean, ramp
 from jaxsurf.stencils.targets import Gradient, Hessian, Laplacian, Partial
 
-from .helpers import check_derivative, operations
+from .helpers import check_derivative, check_derivatives, operations
 
 
 def _plain_sums(rows, axis):
@@ -272,6 +273,29 @@ def test_support_scales_and_does_not_jump(dim):
     # Points beyond the support have no say, whether they are listed or not.
     moved = jnp.asarray(r2[:k]).at[-1].mul(1.5)
     np.testing.assert_allclose(support(moved, on, dim=dim), radius, rtol=1e-6)
+
+
+def test_a_mean_that_is_nearly_the_largest():
+    """Its derivatives, second ones too and where two are the largest; and of nothing it is zero."""
+    values, counted = (jnp.asarray(np.random.default_rng(1).uniform(0.1, 1, (9, 3))) for _ in "ab")
+    values = values.at[:2, 0].set(2.0)
+    largest = values.max(axis=0)
+    mean = power_mean(values, jnp.ones_like(values))
+    assert bool(jnp.all((mean < largest) & (mean > 9 ** (-1 / 32) * largest * (1 - 1e-12))))
+    check_derivatives(lambda *a: power_mean(*a)[0], values, counted, rtol=1e-7)
+    slope = lambda values: jax.grad(lambda values: jnp.sum(power_mean(values, counted)))(values)
+    check_derivative(lambda values: jnp.vdot(slope(values), counted), values, rtol=1e-6)
+    none = jnp.zeros((4, 2))
+    for a, b in ((none, none + 1), (none + 1, none)):
+        assert not power_mean(a, b).any()
+        assert not any(d.any() for d in jax.grad(lambda *ab: power_mean(*ab).sum(), (0, 1))(a, b))
+
+
+def test_a_ramp():
+    x = jnp.array([-jnp.inf, -1.0, 0.0, 0.3, 1.0, 2.0, jnp.inf])
+    np.testing.assert_allclose(ramp(x), [0, 0, 0, 0.16308, 1, 1, 1], rtol=1e-12)
+    slopes = jax.vmap(jax.grad(ramp))(x)
+    np.testing.assert_allclose(slopes, [0, 0, 0, 30 * 0.21**2, 0, 0, 0], rtol=1e-12)
 
 
 def test_derivative_of_support():

@@ -167,41 +167,68 @@ def _calmed(method: AbstractMethod, around: Neighborhood, weights, support):
     others = total(jnp.abs(weights[1:]))
     share = jnp.where(others > 0, -weights[0] / jnp.where(others > 0, others, 1), -jnp.inf)
     # Without a jump where neighbours enter the support.
-    counted = jnp.where(around.mask, taper(around.squared / support**2), 0)
-    tube = power_mean(_bend(around) * support, counted)
+    s = around.squared / support**2
+    tube = support * power_mean(_bend(around), jnp.where(around.mask, taper(s), 0))
     part = ramp((method.least_dominance - share) / _SHORT) * ramp((tube - 1) / _BEYOND)
-    blend = weights + part * (_positive(around, support) - weights)
+    blend = weights + part * (_positive(around, s) / support**2 - weights)
     return jnp.where(part > 0, blend, weights), share
 
 
+@jax.custom_jvp
 def power_mean(values: Float[Array, "k *p"], counted: Float[Array, "k *p"]) -> Float[Array, "*p"]:
     """Nearly the largest, and no more than it; smooth also where several are the largest."""
-    largest = jax.lax.stop_gradient(jnp.max(values, axis=0))
+    return _power_mean(values, counted)[0]
+
+
+def _power_mean(values, counted):
+    """The mean; and what its derivative needs: shares of the largest, and sums, 1 for none."""
+    largest = jnp.max(values, axis=0)
     unit = jnp.where(largest > 0, largest, 1)
-    powers = total(counted * (values / unit) ** _POWER)
+    share = values / unit
+    powers = total(counted * share**_POWER)
     found = powers > 0
-    mean = jnp.where(found, powers, 1) / jnp.where(found, total(counted), 1)
-    return jnp.where(found, unit * mean ** (1 / _POWER), 0)
+    powers, count = (jnp.where(found, a, 1) for a in (powers, total(counted)))
+    mean = jnp.where(found, unit * (powers / count) ** (1 / _POWER), 0)
+    return mean, (unit, share, powers, count)
+
+
+@power_mean.defjvp
+def _power_mean_jvp(primals, tangents):
+    (_, counted), (moved, more) = primals, tangents
+    mean, (unit, share, powers, count) = _power_mean(*primals)
+    below = share ** (_POWER - 1)
+    grown = total(below * (share * more + counted * _POWER * (moved / unit))) / powers
+    return mean, mean / _POWER * (grown - total(more) / count)
 
 
 _POWER = 32
 
 
+@jax.custom_jvp
 def ramp(x):
     """From 0 at 0 to 1 at 1, with two continuous derivatives."""
     x = jnp.clip(x, 0, 1)
     return x**3 * (10 - 15 * x + 6 * x**2)
 
 
+@ramp.defjvp
+def _ramp_jvp(primals, tangents):
+    x = jnp.clip(primals[0], 0, 1)
+    return ramp(primals[0]), 30 * (x * (1 - x)) ** 2 * tangents[0]
+
+
 # Length of the kernel of positive weights in units of the support: about one spacing.
 _NEAR = 0.3
 
 
-def _positive(around: Neighborhood, support) -> Float[Array, "k *p"]:
-    """Multiples of a kernel that give the squared distance the Laplacian it has in the plane."""
-    r2, flat = around.squared, around.offsets.shape[1] - 1
-    kernel = gaussian(r2, _NEAR * support, support, around.mask)
-    second = total(kernel * r2)
+def _positive(around: Neighborhood, s) -> Float[Array, "k *p"]:
+    """Multiples of a kernel that give the squared distance the Laplacian it has in the plane.
+
+    Args:
+        s: squared distances in units of the support, which is the unit of length.
+    """
+    kernel, flat = gaussian(s, _NEAR, 1.0, around.mask), around.offsets.shape[1] - 1
+    second = total(kernel * s)
     eta = 2 * flat * kernel / jnp.where(second > 0, second, 1)
     return with_center(eta[None])[0]
 

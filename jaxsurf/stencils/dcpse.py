@@ -79,7 +79,8 @@ class DCPSE(AbstractMethod):
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
         dim = neighborhood.offsets.shape[1]
         radius = neighborhood.support(dim - 1, self.support)
-        width = radius * (_width(self.order) if self.width is None else self.width)
+        share = _width(self.order) if self.width is None else self.width
+        width = radius * share
         count = _layers(self.order) if self.layers is None else self.layers
         step = radius / (count + 0.5) if self.layer_spacing is None else self.layer_spacing
 
@@ -99,9 +100,10 @@ class DCPSE(AbstractMethod):
         # as it leaves the support.
         fade = jnp.where(neighborhood.mask, taper(neighborhood.squared / radius**2), 0)
         low, high = _degrees(target.order, self.order)
-        w = fade * gaussian(jnp.sum(copies**2, axis=0), width, radius)
+        x = copies / width
+        w = fade * gaussian(jnp.sum(x**2, axis=0), 1.0, 1 / share)
         b = jnp.asarray(target.moments(dim, low, high), w.dtype)
-        x, w = (stored(a, jnp.any(width < 0)) for a in (copies / width, w))
+        x, w = (stored(a, jnp.any(width < 0)) for a in (x, w))
         eta, condition, residual = line_solve(x, w, b, low, high)
         diagnostics = Diagnostics.of(neighborhood, condition, residual, radius, count)
         eta = eta / width**target.order
@@ -148,11 +150,13 @@ class FlatDCPSE(AbstractMethod):
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):
         x = jnp.swapaxes(neighborhood.offsets, 0, 1)
         radius = neighborhood.support(len(x), self.support)
-        width = radius * (_width(self.order) if self.width is None else self.width)
+        share = _width(self.order) if self.width is None else self.width
+        width = radius * share
+        x = x / width
         low, high = _degrees(target.order, self.order)
-        w = gaussian(jnp.sum(x**2, axis=0), width, radius, neighborhood.mask)
+        w = gaussian(jnp.sum(x**2, axis=0), 1.0, 1 / share, neighborhood.mask)
         b = jnp.asarray(target.moments(len(x), low, high), x.dtype)
-        eta, condition, residual = moment_solve(x / width, w, b, low, high)
+        eta, condition, residual = moment_solve(x, w, b, low, high)
         diagnostics = Diagnostics.of(neighborhood, condition, residual, radius, 0)
         return target.components(_with_center(eta / width**target.order, target)), diagnostics
 

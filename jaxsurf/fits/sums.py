@@ -15,7 +15,9 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-# The most numbers that XLA sums in one program.
+from ..machine import CPU, machine
+
+# The most numbers that XLA sums in one program on a CPU.
 _SHORT = 32
 
 
@@ -25,7 +27,8 @@ def total(a: jax.Array, axis: int = 0) -> jax.Array:
     For what is computed in few operations: those before it may be found again for each part.
     """
     count = a.shape[axis]
-    ends = [count * i // -(-count // _SHORT) for i in range(1, -(-count // _SHORT))]
+    parts = -(-count // _SHORT) if machine() is CPU else 1
+    ends = [count * i // parts for i in range(1, parts)]
     return functools.reduce(jnp.add, [jnp.sum(part, axis) for part in jnp.split(a, ends, axis)])
 
 

@@ -13,8 +13,9 @@ from jaxtyping import Array, Bool, Float
 from .adapt import dominance, is_better, report, represented, share_wanted, sizes_to_try
 from .adapt import residual_tolerance as residual_tolerance
 from .arguments import as_many, instance, whole
+from .blocks import blocks_of, of_each, rows_of
 from .cloud import PointCloud
-from .compiling import Pieces, at_once, copying_jit, is_quick, namespace, on_device, sized_jit
+from .compiling import Pieces, at_once, copying_jit, is_quick, namespace, on_device
 from .cores import calls_library, divided, side_by_side
 from .failures import (
     is_concrete,
@@ -25,11 +26,10 @@ from .failures import (
     warn,
     without_derivatives,
 )
-from .fits.moments import blockwise, in_blocks, out_of_blocks
+from .fits.moments import blockwise
 from .indices import mask as checked_mask
 from .machine import TRIED, block
 from .neighbors import Neighbors, Rows, changed, find_neighbors, nearest_of, switched_on
-from .stencils.gathers import take
 from .stencils.method import AbstractMethod, Diagnostics, Neighborhood, weights_by
 from .stencils.stencil import Stencil
 from .stencils.targets import Laplacian
@@ -150,18 +150,17 @@ def build_with(cloud, neighbors, method, target, find: Callable) -> tuple[list[S
     neighbors = switched_on(cloud, neighbors)
     _check_sizes(cloud, neighbors, method, target, True)
     rows = np.arange(cloud.n, dtype=np.int32)
-    blocks = blocks_of(cloud, neighbors, rows, block(method.batch_size))
-    weights, found = _weights_and_more(blocks, method, target, find)
+    size = block(method.batch_size)
+    weights, found = of_each(_weights_and_more, cloud, neighbors, rows, size, method, target, find)
     return _stencils(cloud, neighbors, *rows_of(*weights, cloud.n)), found
 
 
-@sized_jit
-def _weights_and_more(blocks, method, target, find):
-    def both(block):
-        around = Neighborhood.of(*block)
-        return weights_by(method, around, target), find(around)
+def _weights_and_more(around: Neighborhood, method, target, find):
+    return weights_by(method, around, target), find(around)
 
-    return blockwise(both, blocks)
+
+def _weights(around: Neighborhood, method, target):
+    return weights_by(method, around, target)
 
 
 def stencil_weights(
@@ -182,7 +181,8 @@ def stencil_weights(
         return rows_of(*_weights_of_blocks(blocks, method, target), len(rows))
 
     if not is_concrete(cloud, neighbors, rows):
-        return found(neighbors, rows)
+        each = of_each(_weights, cloud, neighbors, rows, size, method, target)
+        return rows_of(*each, len(rows))
     places = divided(len(rows), size, neighbors.mask.shape[1] * (2 * cloud.dim + 1))
     if len(places) == 1:
         return found(neighbors, rows)
@@ -223,20 +223,6 @@ def _joined(parts, count: int):
 
 
 @copying_jit
-def blocks_of(cloud, neighbors, rows, size: int):
-    """Positions and normals of the neighbours of some rows, mask and radius, in blocks."""
-    cloud, slots = cloud.seen, in_blocks(neighbors.indices.T, size)
-    # One coordinate at a time: one gather for all of them is slower.
-    points, normals = (
-        [take(column, slots) for column in vectors.T] for vectors in (cloud.points, cloud.normals)
-    )
-    radius = neighbors.radius
-    if radius is not None:
-        radius = namespace(radius).broadcast_to(radius, (cloud.n,))[in_blocks(rows, size)]
-    return points, normals, in_blocks(neighbors.mask.T, size), radius
-
-
-@copying_jit
 def _slots_first(indices):
     return indices.T
 
@@ -245,13 +231,6 @@ def _slots_first(indices):
 def _weights_of_blocks(blocks, count, method, target):
     weights = lambda block: weights_by(method, Neighborhood.of(*block), target)
     return blockwise(weights, blocks, count)
-
-
-@copying_jit
-def rows_of(weights, others, count: int):
-    """Weights, with the slots first, and what else was found of the rows, out of their blocks."""
-    weights, others = jax.tree.map(lambda a: out_of_blocks(a, count), (weights, others))
-    return jax.tree.map(lambda a: namespace(a).moveaxis(a, -2, 0), weights), others
 
 
 # --- neighbourhoods ------------------------------------------------------------------------

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .build import blocks_of, determined, rows_of
+from .blocks import blocks_of, rows_of
+from .build import determined
 from .cloud import PointCloud
 from .compiling import Pieces, copying_jit, namespace, on_device
 from .failures import is_concrete, refuse

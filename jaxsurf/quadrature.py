@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .build import blocks_of, determined, rows_of
+from .blocks import blocks_of, rows_of
+from .build import determined
 from .cloud import PointCloud
 from .compiling import copying_jit, kept, namespace, sized_jit, stored
 from .failures import is_concrete, refuse, warn

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import importlib
 import os
 import sys
@@ -219,7 +220,10 @@ def _run(name: str, quick: bool, out: Path) -> int:
     print(f"{name}: {title}", flush=True)
     start = time.perf_counter()
     try:
-        rows = importlib.import_module(f"experiments.{module}").run(quick, out)
+        experiment = importlib.import_module(f"experiments.{module}")
+        # What is imported stays: full collections, of which tracing makes many, pass it by.
+        gc.freeze()
+        rows = experiment.run(quick, out)
     except FileNotFoundError as error:
         print(f"{name} skipped: {error}", flush=True)
         return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import itertools
 import os
 import sys
@@ -39,6 +40,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     # The command line is a program of its own: the library never touches the configuration.
     jax.config.update("jax_enable_x64", True)
+    if arguments is None:
+        # What is imported stays: full collections, of which tracing makes many, pass it by.
+        gc.freeze()
 
     def sample():
         if options.surface is None:

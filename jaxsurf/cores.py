@@ -1,4 +1,4 @@
-"""Programs side by side: a loop over blocks runs on one core, so that each core is given a part.
+"""Programs side by side: a loop over blocks runs on one core, so that each core is given parts.
 
 Only programs that call no library: jaxlib's LAPACK waits in a thread of a pool for other threads
 of that pool, and two programs may take them all from each other, for ever.
@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .machine import machine
+from .machine import PART, machine
 
 # What runs outside of what XLA compiles.
 _OUTSIDE = {*dir(jax.lax.linalg), "geqrf", "ffi_call", "pure_callback", "io_callback"}
@@ -30,7 +30,10 @@ def count_cores() -> int:
 
 
 def divided(count: int, size: int, numbers: int) -> list[np.ndarray]:
-    """Places of rows, divided among the cores: equally many each, in whole blocks.
+    """Places of rows, divided among the cores: equally many in each part, in whole blocks.
+
+    Each core is given several parts where there are many rows: what is read for a part is soon let
+    go, and its memory is used again.
 
     The last of them may be repeated.
 
@@ -38,7 +41,8 @@ def divided(count: int, size: int, numbers: int) -> list[np.ndarray]:
         numbers: given to a program for each row; few are left in one piece.
     """
     cores = min(count_cores(), count * numbers // (2 * machine().quick or 1))
-    each = -(-count // (max(cores, 1) * size)) * size
+    parts = cores * max(count * numbers // (PART * max(cores, 1)), 1)
+    each = -(-count // (max(parts, 1) * size)) * size
     starts = range(0, count, each) if cores > 1 else [0]
     return [np.minimum(np.arange(i, i + each), count - 1) for i in starts]
 
@@ -52,7 +56,7 @@ def side_by_side(f: Callable, parts: list) -> list:
             return context.run(lambda: jax.block_until_ready(f(part)))
 
     contexts = [contextvars.copy_context() for _ in parts]
-    with ThreadPoolExecutor(len(parts)) as threads:
+    with ThreadPoolExecutor(min(len(parts), count_cores())) as threads:
         return list(threads.map(call, parts, contexts))
 
 

@@ -25,6 +25,8 @@ PAIRS = 64  # that see all others, see `block_of_pairs`
 MOVING, TRIED = 4096, 256
 # Blocks that one call treats where arrays are small.
 PIECE = 8
+# Numbers, at least, that a core is given at once where arrays are large.
+PART = 12_000_000
 # Columns at once: right-hand sides, directions of a Jacobian, colours of a product of matrices.
 SOLVED, PUSHED, COLORS = 64, 32, 16
 # Of programs that are compiled quickly on a CPU; and, for whoever asks for it, without any

@@ -1,4 +1,4 @@
-"""Weights computed in parts, one for each core."""
+"""Weights computed in parts, one or several for each core."""
 
 import jax
 import jax.numpy as jnp
@@ -88,8 +88,18 @@ def test_few_rows_are_not_divided(monkeypatch):
     monkeypatch.setattr(cores, "count_cores", lambda: 3)
     assert len(cores.divided(10_000, 100, 1)) == 1
     many = cores.divided(10_000_000, 100, 10)
-    assert len(many) == 3
+    assert len(many) == 6 and len(many[0]) * 10 >= machine.PART
     assert np.array_equal(np.unique(np.concatenate(many)), np.arange(10_000_000))
+
+
+def test_many_rows_come_in_several_parts_for_each_core(divided, monkeypatch):
+    """Each is given at least so many numbers as a part is to have."""
+    monkeypatch.setattr(cores, "PART", 30 * 7 * 110)
+    cloud = js.sphere(N)
+    asked = cloud, js.find_neighbors(cloud, 30), js.GFDM(degree=2), build.Laplacian()
+    parts, whole = build.stencil_weights(*asked), in_one_piece(monkeypatch, *asked)
+    assert divided == [4]  # of 200 rows, in blocks of 100; three cores, twice
+    jax.tree.map(np.testing.assert_array_equal, parts, whole)
 
 
 def test_accelerators_are_not_divided(monkeypatch):

@@ -73,8 +73,9 @@ class TangentPlane(eqx.Module):
 
         def seen() -> TangentPlane:
             radius = around.support(around.offsets.shape[1] - 1, support)
-            weights = gaussian(around.squared / radius**2, width, 1.0, around.mask)
-            plane = cls.at(around.normals[0], around.offsets, weights, radius * width, radius)
+            unit = radius * width
+            weights = gaussian(around.squared, unit, radius, around.mask)
+            plane = cls.at(around.normals[0], around.offsets, weights, unit, radius)
             # Without the barrier the compiler finds exponentials again for every use of them.
             return jax.lax.optimization_barrier(plane)
 
@@ -85,8 +86,7 @@ class TangentPlane(eqx.Module):
         """With weights of its own, perpendicular to a normal `(d, *p)`; also in NumPy."""
         xp = namespace(normal)
         frame = xp.moveaxis(frames_of(normal.T), (-2, -1), (0, 1))
-        offsets = offsets / width
-        along = [dot(offsets, axis[None]) for axis in frame]
+        along = [dot(offsets, axis[None]) / width for axis in frame]
         return cls(frame[:-1], xp.stack(along[:-1]), along[-1], weights, width, radius)
 
     def surface(self, low: int, high: int) -> tuple[Float[AnyArray, "m *p"], Float[AnyArray, "*p"]]:

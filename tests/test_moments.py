@@ -8,6 +8,7 @@ import pytest
 
 from jaxsurf.fits.kernels import gaussian, support, taper
 from jaxsurf.fits.lines import are_steep, line_solve
+from jaxsurf.fits.lines import moments as moments_of_lines
 from jaxsurf.fits.moments import (
     blockwise,
     in_blocks,
@@ -304,18 +305,18 @@ def test_derivative_of_support():
     check_derivative(lambda r: support(r, jnp.ones(30, bool), dim=2), r2, rtol=1e-7)
 
 
-@pytest.mark.parametrize("dim, flat", [(2, False), (3, False), (3, True)])
-def test_lines_have_the_weights_of_their_points(dim, flat):
-    """Steep lines are followed by their last coordinate, flatter ones point by point."""
+@pytest.mark.parametrize("dim, rise", [(2, 1), (2, 0.05), (3, 1), (3, 0.05), (3, None)])
+def test_lines_have_the_weights_of_their_points(dim, rise):
+    """Each is followed by the coordinate that changes most along it."""
     rng = np.random.default_rng(dim)
     count, lines, low, high = 5, 24, 1, 3
     along = rng.normal(size=(dim, 1, lines, 2)) * 0.2
-    along[-1] = 0.05 if flat else 1
+    along[-1] = rng.normal(size=along.shape[1:]) * 0.2 if rise is None else rise
     steps = np.linspace(-0.8, 0.8, count).reshape(1, count, 1, 1)
     x = jnp.asarray(rng.uniform(-1, 1, (dim, 1, lines, 2)) + steps * along)
     w = jnp.exp(-jnp.sum(x**2, axis=0)) * (np.arange(lines) < lines - 3)[:, None]
     b = jnp.asarray(rng.normal(size=(len(multi_indices(dim, low, high)), 2)))
-    assert bool(are_steep(x, w)) != flat
+    assert bool(are_steep(x, w)) == (rise == 1)
 
     def one_by_one(x, w):
         every = x.reshape(dim, -1, 2), w.reshape(-1, 2)
@@ -334,6 +335,15 @@ def test_lines_have_the_weights_of_their_points(dim, flat):
     for a, c in ((have, want), (d_have, d_want)):
         assert float(jnp.max(jnp.abs(a - c))) < slack * float(jnp.max(jnp.abs(c)))
     assert not have[:, -3:].any()
+
+
+@pytest.mark.parametrize("steep", [True, False])
+def test_moments_of_lines_do_not_go_through_their_points(steep):
+    """Nor where the lines lie in all directions: 1,400 operations for a line, not 13,000."""
+    rng = np.random.default_rng(0)
+    x, w = jnp.asarray(rng.normal(size=(3, 7, 40, 48))), jnp.asarray(rng.uniform(size=(7, 40, 48)))
+    program = jax.jit(lambda x, w: moments_of_lines(x, w, 10, steep)).lower(x, w).compile()
+    assert program.cost_analysis()["flops"] < 2_500 * w[0].size
 
 
 def test_what_a_fit_leaves_is_computed_once():

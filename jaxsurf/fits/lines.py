@@ -5,9 +5,8 @@ weighted points on it make of a monomial follows from two others,
 
 $$F[x^{a+1} y^b z^c] = x_0 F[x^a y^b z^c] + u F[x^a y^b z^{c+1}],$$
 
-starting from the sums $F[z^c]$: the points themselves are needed for these only. Monomials stand
-in groups of the same b, ordered by a, then c. The shift of c is then a shift of the rows, at the
-price of a few at the ends of the runs that mean nothing and are read by none that do.
+starting from the sums $F[z^c]$: the points themselves are needed for these only. All of it, and the
+sums over the lines, is one program of straight-line code, which stores nothing in between.
 """
 
 from __future__ import annotations
@@ -16,84 +15,79 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..compiling import is_quick, kept, stored
+from ..machine import CPU, machine
 from . import systems
 from .moments import add_moved_moments, all_moments, arranged, columns, moved
 from .monomials import monomial_rows, monomials, multi_indices, polynomial_count
-
-# Least cosine between a line and the last axis. Flatter ones have slopes whose powers cancel.
-_STEEP = 0.7
+from .sums import sums
 
 
 def are_steep(x: Float[Array, "dim l k *p"], w: Float[Array, "l k *p"]) -> Bool[Array, ""]:
-    """Whether all lines with a weight are steep enough to be followed by their last coordinate."""
-    return jnp.all(_is_steep(x[:, -1] - x[:, 0]) | ~jnp.any(w > 0, axis=0))
+    """Whether the last coordinate changes most along all lines that have a weight."""
+    last = len(x) - 1
+    return jnp.all((_steepest(x) == last) | ~jnp.any(w > 0, axis=0))
 
 
-def _is_steep(along):
-    return along[-1] ** 2 >= _STEEP**2 * jnp.sum(along**2, axis=0)
+def _steepest(x):
+    """The coordinate that changes most along each line: slopes above 1 have powers that cancel."""
+    return jnp.argmax(jnp.abs(x[:, -1] - x[:, 0]), axis=0)
 
 
 def functionals(
-    x: Float[Array, "dim l k *p"], w: Float[Array, "l k *p"], high: int
-) -> list[Float[Array, "rows k *p"]]:
-    """What the points of each of k lines make of the monomials up to a degree, in groups."""
+    x: Float[Array, "dim l k *p"], w: Float[Array, "l k *p"], high: int, steep: bool = True
+) -> list[Float[Array, "k *p"]]:
+    """What the points of each of k lines make of the monomials up to a degree, graded.
+
+    Args:
+        steep: whether the last coordinate is that which changes most along each of the lines.
+    """
+    basis = list(map(tuple, multi_indices(len(x), 0, high).tolist()))
+    if steep:
+        found = _on_steep(x, w, high)
+        return [found[g] for g in basis]
+    # Coordinates in another order for each line, and the monomials accordingly.
+    steepest, turns = _steepest(x), range(1, len(x) + 1)
+    each = jnp.broadcast_to(steepest, x.shape)
+    found = _on_steep(jax.lax.select_n(each, *(jnp.roll(x, -i, 0) for i in turns)), w, high)
+    return [jax.lax.select_n(steepest, *(found[g[i:] + g[:i]] for i in turns)) for g in basis]
+
+
+def _on_steep(x, w, high) -> dict[tuple[int, ...], Array]:
     along = x[:, -1] - x[:, 0]
-    rise = jnp.where(_is_steep(along), along[-1], 1)
+    # Lines without a weight may have any slope, or none.
+    rise = jnp.where(2 * abs(along[-1]) > jnp.max(abs(along), axis=0), along[-1], 1)
     slopes = along[:-1] / rise
     feet = x[:-1, 0] - slopes * x[-1, 0]
-    slopes, feet = jax.lax.optimization_barrier((slopes, feet))
-
-    def power(term, _):
-        return term * x[-1], jnp.sum(term, axis=0)
-
-    run = jax.lax.scan(power, w, length=high + 1)[1]
-    runs = [run]
-    for _ in range(high):
-        runs.append(_next(runs[-1], len(runs[-1]) - 1, feet[0], slopes[0]))
-    groups = [jax.lax.optimization_barrier(jnp.concatenate(runs))]
-    for b in range(1, high + 1 if len(x) > 2 else 1):
-        groups.append(_next(groups[-1], len(groups[0]) - b * (b + 1) // 2, feet[1], slopes[1]))
-    return groups
-
-
-def _next(rows, count: int, foot, slope):
-    # The barrier, as the compiler finds cheap values again at every use.
-    return jax.lax.optimization_barrier(foot * rows[:count] + slope * rows[1 : count + 1])
+    feet, slopes, heights = list(feet), list(slopes), list(x[-1])
+    add, times = jax.lax.add, jax.lax.mul
+    terms, found = list(w), {}
+    for c in range(high + 1):
+        found[(0,) * (len(x) - 1) + (c,)] = functools.reduce(add, terms)
+        terms = list(map(times, terms, heights))
+    basis = map(tuple, multi_indices(len(x), 0, high).tolist())
+    for g in sorted(basis, key=lambda g: sum(g[:-1])):
+        if g not in found:
+            axis = next(a for a in range(len(x)) if g[a])
+            lower = (*g[:axis], g[axis] - 1, *g[axis + 1 :])
+            shifted = (*lower[:-1], lower[-1] + 1)
+            found[g] = add(times(feet[axis], found[lower]), times(slopes[axis], found[shifted]))
+    return found
 
 
-@functools.cache
-def _places(dim: int, high: int) -> dict[tuple[int, ...], int]:
-    """Where the monomials stand in all groups, one after another."""
-    count = (high + 1) * (high + 2) // 2
-    starts = np.cumsum([0] + [count - b * (b + 1) // 2 for b in range(high + 1)]).tolist()
-    run = [a * (high + 1) - a * (a - 1) // 2 for a in range(high + 1)]
-    return {
-        tuple(g): starts[g[1] if dim > 2 else 0] + run[g[0]] + g[-1]
-        for g in multi_indices(dim, 0, high).tolist()
-    }
+def moments(x, w, high, steep):
+    """What all lines together make of the monomials up to a degree, graded; see `functionals`."""
+    return jnp.stack(sums(functionals(x, w, high, steep), 0))
 
 
-def _moments(x, w, high):
-    """The moments of all lines together, up to twice the degree, graded."""
-    sums = jnp.concatenate([jnp.sum(group, axis=1) for group in functionals(x, w, 2 * high)])
-    places = _places(len(x), 2 * high)
-    return sums[np.array([places[tuple(g)] for g in multi_indices(len(x), 0, 2 * high).tolist()])]
-
-
-def _weights(a, x, w, low, high):
+def _weights(a, x, w, low, high, steep):
     """Sums over each line of w times the polynomials with coefficients a."""
-    basis = multi_indices(len(x), low, high).tolist()
-    groups = functionals(x, w, high)
-    order = np.full(sum(map(len, groups)), len(basis), np.int32)
-    order[[_places(len(x), high)[tuple(g)] for g in basis]] = np.arange(len(basis))
-    a = jnp.concatenate([a, jnp.zeros_like(a[:1])])[order]
-    ends = np.cumsum([len(group) for group in groups])[:-1]
-    parts = zip(jnp.split(a, ends), groups)
-    return sum(jnp.sum(part[:, :, None] * group[:, None], axis=0) for part, group in parts)
+    found = functionals(x, w, high, steep)[len(multi_indices(len(x), 0, low - 1)) :]
+    each = lambda a: jax.lax.broadcast(a, w.shape[1:2])
+    one = lambda a: functools.reduce(jax.lax.add, map(jax.lax.mul, map(each, a), found))
+    return jnp.stack([one(list(jnp.unstack(a_c))) for a_c in jnp.unstack(a, axis=1)])
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
@@ -108,7 +102,7 @@ def line_solve(
 
     Args:
         x: coordinates of the points in units of the neighbourhood; lines about along the last axis
-            make it fast, others are served too.
+            are treated somewhat faster than others.
         w, b, low, high: as for `moment_solve`, with one b for all.
 
     Returns:
@@ -121,19 +115,18 @@ def line_solve(
 
 
 def _solve(x, w, b, low, high):
-    every = _flat(x), w.reshape(-1, *w.shape[2:])
-
-    def pointwise(a):
-        s = systems.combine(a, monomials(every[0], high)[len(multi_indices(len(x), 0, low - 1)) :])
-        return jnp.sum(w * s.reshape(-1, *w.shape), axis=1)
-
-    steep = not is_quick() and are_steep(x, w)
-    found = _either(steep, lambda: _moments(x, w, high), lambda: all_moments(*every, high))
+    if is_quick() or machine() is not CPU:
+        every = _flat(x), w.reshape(-1, *w.shape[2:])
+        found, weights = all_moments(*every, high), lambda a: _weights_by_points(a, x, w, low, high)
+    else:
+        steep = are_steep(x, w)
+        found = _either(steep, lambda of: moments(x, w, 2 * high, of))
+        weights = lambda a: _either(steep, lambda of: _weights(a, x, w, low, high, of))
     gram = arranged(kept(found), len(x), low, high)
     solve, condition = systems.factor(gram)
     b = b.astype(w.dtype).reshape(*b.shape, *(1,) * (w.ndim - 2))
     a = kept(solve(jnp.broadcast_to(b, (*b.shape[:2], *w.shape[2:]))))
-    eta = _either(steep, lambda: _weights(a, x, w, low, high), lambda: pointwise(a))
+    eta = weights(a)
     error = jnp.max(jnp.abs(systems.symmetric(gram, a) - b), axis=(0, 1))
     size = jnp.max(jnp.abs(b), axis=(0, 1))
     return (eta, condition, error / jnp.where(size > 0, size, 1)), (solve, a)
@@ -162,9 +155,15 @@ def _line_solve_jvp(low, high, primals, tangents):
     return out, (d_eta, jnp.zeros_like(out[1]), jnp.zeros_like(out[2]))
 
 
+def _weights_by_points(a, x, w, low, high):
+    s = systems.combine(a, monomials(_flat(x), high)[len(multi_indices(len(x), 0, low - 1)) :])
+    return jnp.sum(w * s.reshape(-1, *w.shape), axis=1)
+
+
 def _flat(x):
     return x.reshape(len(x), -1, *x.shape[3:])
 
 
-def _either(condition, one, other):
-    return other() if condition is False else jax.lax.cond(condition, one, other)
+def _either(condition, function):
+    """A function of True or of False: what is traced has a program for each."""
+    return jax.lax.cond(condition, lambda: function(True), lambda: function(False))

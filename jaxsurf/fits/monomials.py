@@ -80,7 +80,7 @@ def monomial_rows(
     coordinates = list(x)
     rows = [jnp.ones_like(x[0]) if first is None else first]
     for lower, axis in _parents(len(x), high):
-        rows.append(rows[lower] * coordinates[axis])
+        rows.append(jax.lax.mul(rows[lower], coordinates[axis]))
     return rows
 
 

@@ -73,7 +73,7 @@ class DCPSE(AbstractMethod):
         return polynomial_count(dim - 1, high)
 
     # The systems of a block stay in the second-level cache.
-    batch_size = property(lambda self: 48 if self.order < 3 else 8)
+    batch_size = property(lambda self: 48 if self.order < 5 else 8)
     polynomial_degree = property(lambda self: max(self.order, 2))
 
     def weights(self, neighborhood: Neighborhood, target: AbstractTarget):

@@ -54,7 +54,8 @@ def test_what_faces_what():
     way = x[:, None] - x
     gap = np.linalg.norm(way, axis=2)
     ups = np.einsum("ijd,jd->ij", way, n) / np.where(gap > 0, gap, 1)
-    good = (gap < 0.45) & (n @ n.T < -0.45) & (np.abs(ups) > 0.85) & (np.abs(ups.T) > 0.85)
+    good = (n @ n.T < -0.05) & (np.abs(ups) > 0.6) & (np.abs(ups.T) > 0.6)
+    good &= (gap < 0.45) & (gap < 0.45 * 1.18 * np.sqrt((1 - n @ n.T) / 2))
     good &= ups * ups.T > 0
     wanted = np.argwhere(np.triu(good))
     assert {tuple(p) for p in found.pairs.tolist()} == {tuple(p) for p in wanted.tolist()}

@@ -18,9 +18,10 @@ from ..neighbors import Neighbors
 
 Kind = Literal["delete", "non-penetration", "merge"]
 KINDS = get_args(Kind)
-# Points face each other if the cosine of their normals is below, and if the way from one to the
-# other leaves both sheets steeply: its cosine with their normals is above.
-_OPPOSED, _STEEP = -0.45, 0.85
+# Points face each other if the cosine of their normals is below, if the way from one to the other
+# leaves both sheets steeply: its cosine with their normals is above; and if a circle through both
+# with these normals is no wider than this, in the distance asked for.
+_OPPOSED, _STEEP, _WIDE = -0.05, 0.6, 1.18
 # Sheets are watched from so many contact distances on.
 _WATCHED = 2.0
 # Between two looks a point may always go as far as this, in contact distances: looks at sheets
@@ -34,7 +35,8 @@ class Contact(eqx.Module):
     r"""What happens where two sheets of a surface come near each other.
 
     Sheets are of two surfaces or of one, and meet from outside, or through the inside of a part
-    that has become thin. Those are found by their normals, which oppose each other. Only sheets of
+    that has become thin. Those are found by their normals, which oppose each other; so do the sides
+    of a corner of less than a right angle, which "delete" rounds off before it folds. Only sheets of
     two surfaces that are kept apart, or stick, may have normals that point the same way.
 
     Args:
@@ -116,9 +118,10 @@ def facing(cloud: PointCloud, reach: float) -> Facing:
     way = x[j] - x[i]
     gap = np.linalg.norm(way, axis=1)
     ups = [np.einsum("md,md->m", way, s * n[k]) / gap for k, s in ((i, 1), (j, -1))]
-    opposed = np.einsum("md,md->m", n[i], n[j]) < _OPPOSED
+    cosine = np.einsum("md,md->m", n[i], n[j])
     steep = np.minimum(*np.abs(ups)) > _STEEP
-    good = opposed & steep & (ups[0] * ups[1] > 0) & (gap <= reach)
+    near = gap <= reach * np.minimum(1, _WIDE * np.sqrt((1 - cosine) / 2))
+    good = near & steep & (cosine < _OPPOSED) & (ups[0] * ups[1] > 0)
     return Facing(rows[np.stack([i, j], axis=1)[good]], gap[good], ups[0][good] < 0)
 
 

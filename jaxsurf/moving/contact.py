@@ -35,7 +35,7 @@ class Contact(eqx.Module):
     r"""What happens where two sheets of a surface come near each other.
 
     Sheets are of two surfaces or of one, and meet from outside, or through the inside of a part
-    that has become thin. Those are found by their normals, which oppose each other; so do the sides
+    that has become thin. Those are found by their normals, which oppose each other; so do those
     of a corner of less than a right angle, which "delete" rounds off before it folds. Only sheets of
     two surfaces that are kept apart, or stick, may have normals that point the same way.
 

@@ -36,8 +36,8 @@ class Contact(eqx.Module):
 
     Sheets are of two surfaces or of one, and meet from outside, or through the inside of a part
     that has become thin. Those are found by their normals, which oppose each other; so do those
-    of a corner of less than a right angle, which "delete" rounds off before it folds. Only sheets of
-    two surfaces that are kept apart, or stick, may have normals that point the same way.
+    of a corner of less than a right angle, which "delete" rounds off before it folds. Only sheets
+    of two surfaces that are kept apart, or stick, may have normals that point the same way.
 
     Args:
         distance: at which sheets touch, in length. For "delete" three to five spacings: a neck is

@@ -13,6 +13,7 @@ import scipy.sparse
 
 import jaxsurf as js
 
+from ..data import bunny
 from ..report import relative_l2
 from .baselines import numpy_gfdm, plain_jax_gfdm
 from .timing import first_and_median, peak_gib, side_by_side
@@ -79,6 +80,30 @@ def build(name: str, n: int) -> dict:
     )
     return {"build s": seconds, "first call s": first - seconds,
             "peak GiB": peak_gib(), "GiB before": before}  # fmt: skip
+
+
+def scan_beside_sphere(name: str, n: int) -> dict:
+    """The bunny's stencils with the lists chosen for it, beside those of a sphere, in turn."""
+    method, _ = METHODS[name]
+    clouds = bunny(n), js.sphere(n)
+    lists = [js.choose_neighbors(cloud, method=method) for cloud in clouds]
+    operators = [laplacian(*both, method) for both in zip(clouds, lists)]
+    u = [jnp.sin(cloud.points @ jnp.array([1.0, 2.0, 1.5])) for cloud in clouds]
+
+    def total(points, cloud, neighbors, u):
+        cloud = js.PointCloud(points, cloud.normals)
+        return jnp.sum(laplacian(cloud, neighbors, method)(u) ** 2)
+
+    apply, slope = jax.jit(lambda operator, u: operator(u)), jax.jit(jax.grad(total))
+    transposed = [operator.T for operator in operators]
+    calls = {
+        "build": lambda i: laplacian(clouds[i], lists[i], method).weights,
+        "apply": lambda i: apply(operators[i], u[i]),
+        "apply transposed": lambda i: apply(transposed[i], u[i]),
+        "gradient": lambda i: slope(clouds[i].points, clouds[i], lists[i], u[i]),
+    }
+    beside = lambda call: side_by_side(lambda: call(0), lambda: call(1))[2]
+    return {what: beside(call) for what, call in calls.items()}
 
 
 def build_beside_numpy(degree: int, k: int, n: int) -> dict:

@@ -21,7 +21,7 @@ from ..compiling import is_quick, kept, stored
 from ..machine import CPU, machine
 from . import systems
 from .moments import add_moved_moments, all_moments, arranged, columns, moved
-from .monomials import monomial_rows, monomials, multi_indices, polynomial_count
+from .monomials import monomial_rows, monomials, multi_indices, polynomial_count, position
 from .sums import sums
 
 
@@ -44,7 +44,7 @@ def functionals(
     Args:
         steep: whether the last coordinate is that which changes most along each of the lines.
     """
-    basis = list(map(tuple, multi_indices(len(x), 0, high).tolist()))
+    basis = position(len(x), high)
     if steep:
         found = _on_steep(x, w, high)
         return [found[g] for g in basis]
@@ -56,6 +56,7 @@ def functionals(
 
 
 def _on_steep(x, w, high) -> dict[tuple[int, ...], Array]:
+    """The same by multi-index, with the last coordinate as the parameter of all lines."""
     along = x[:, -1] - x[:, 0]
     # Lines without a weight may have any slope, or none.
     rise = jnp.where(2 * abs(along[-1]) > jnp.max(abs(along), axis=0), along[-1], 1)
@@ -67,8 +68,8 @@ def _on_steep(x, w, high) -> dict[tuple[int, ...], Array]:
     for c in range(high + 1):
         found[(0,) * (len(x) - 1) + (c,)] = functools.reduce(add, terms)
         terms = list(map(times, terms, heights))
-    basis = map(tuple, multi_indices(len(x), 0, high).tolist())
-    for g in sorted(basis, key=lambda g: sum(g[:-1])):
+    # Each after those that its recurrence reads.
+    for g in sorted(position(len(x), high), key=lambda g: sum(g[:-1])):
         if g not in found:
             axis = next(a for a in range(len(x)) if g[a])
             lower = (*g[:axis], g[axis] - 1, *g[axis + 1 :])

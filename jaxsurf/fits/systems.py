@@ -251,8 +251,8 @@ def _diagonal(a):
 
 
 def _times(a, v):
-    """Of each of several functions. (Straight-line code is long: JAX traces its own operations
-    three times as fast as those that are written as in NumPy.)"""
+    """Of each of several functions. (Straight-line code is long, and JAX traces its own operations
+    sooner than those that are written as in NumPy.)"""
     return jax.lax.mul(a, jax.lax.broadcast(v, a.shape[:1]))
 
 

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..compiling import is_quick, kept, stored
-from ..machine import CPU, machine
 from . import systems
 from .moments import add_moved_moments, all_moments, arranged, columns, moved
 from .monomials import monomial_rows, monomials, multi_indices, polynomial_count, position
@@ -116,7 +115,7 @@ def line_solve(
 
 
 def _solve(x, w, b, low, high):
-    if is_quick() or machine() is not CPU:
+    if is_quick():
         every = _flat(x), w.reshape(-1, *w.shape[2:])
         found, weights = all_moments(*every, high), lambda a: _weights_by_points(a, x, w, low, high)
     else:

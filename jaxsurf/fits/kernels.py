@@ -21,16 +21,26 @@ def taper(s: Float[Array, "*q"]) -> Float[Array, "*q"]:
     return jnp.where(inside, (1 - s**4) ** 3, 0)
 
 
+@jax.custom_jvp
 def gaussian(r2: Float[Array, "*q"], width, radius, on=True) -> Float[Array, "*q"]:
     r"""$e^{-r^2/\epsilon^2}$ (Singh et al. 2023, eq. 5), tapered to zero at the radius.
 
-    Zero also where `on` is False. Written as one exponential, which is then computed once:
-    a product of two factors would be formed again at every use.
+    Zero also where `on` is False.
     """
-    s = r2 / radius**2
-    inside = on & (s < 1)
-    log_taper = 3 * jnp.log(1 - jnp.where(inside, s, 0) ** 4)
-    return jnp.exp(jnp.where(inside, log_taper - r2 / width**2, -jnp.inf))
+    return jnp.exp(-r2 / width**2) * jnp.where(on, taper(r2 / radius**2), 0)
+
+
+@gaussian.defjvp
+def _gaussian_jvp(primals, tangents):
+    # That of the logarithm, as the exponential is there already.
+    lengths, on = primals[:-1], primals[-1]
+
+    def logarithm(r2, width, radius):
+        s = r2 / radius**2
+        return 3 * jnp.log(1 - jnp.where(on & (s < 1), s, 0) ** 4) - r2 / width**2
+
+    value = gaussian(*primals)
+    return value, value * jax.jvp(logarithm, lengths, tangents[:-1])[1]
 
 
 # Of k listed neighbours the support takes in about three quarters on even points, so that it

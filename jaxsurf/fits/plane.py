@@ -74,9 +74,9 @@ class TangentPlane(eqx.Module):
         def seen() -> TangentPlane:
             radius = around.support(around.offsets.shape[1] - 1, support)
             unit = radius * width
-            weights = gaussian(around.squared, unit, radius, around.mask)
+            # The compiler would find the factors again for every use of their product.
+            weights = stored(gaussian(around.squared, unit, radius, around.mask), unit[0] < 0)
             plane = cls.at(around.normals[0], around.offsets, weights, unit, radius)
-            # Without the barrier the compiler finds exponentials again for every use of them.
             return jax.lax.optimization_barrier(plane)
 
         return once(around, (width, support), seen)

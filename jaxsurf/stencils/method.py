@@ -166,12 +166,19 @@ def _calmed(method: AbstractMethod, around: Neighborhood, weights, support):
     """
     others = total(jnp.abs(weights[1:]))
     share = jnp.where(others > 0, -weights[0] / jnp.where(others > 0, others, 1), -jnp.inf)
-    # Without a jump where neighbours enter the support.
-    s = around.squared / support**2
-    tube = support * power_mean(_bend(around), jnp.where(around.mask, taper(s), 0))
-    part = ramp((method.least_dominance - share) / _SHORT) * ramp((tube - 1) / _BEYOND)
-    blend = weights + part * (_positive(around, s) / support**2 - weights)
-    return jnp.where(part > 0, blend, weights), share
+    short = ramp((method.least_dominance - share) / _SHORT)
+
+    @jax.checkpoint
+    def calmed():
+        # Without a jump where neighbours enter the support.
+        s = around.squared / support**2
+        tube = support * power_mean(_bend(around), jnp.where(around.mask, taper(s), 0))
+        part = short * ramp((tube - 1) / _BEYOND)
+        blend = weights + part * (_positive(around, s) / support**2 - weights)
+        return jnp.where(part > 0, blend, weights)
+
+    # Few blocks have a point without a dominant centre.
+    return jax.lax.cond(jnp.any(short > 0), calmed, lambda: weights), share
 
 
 @jax.custom_jvp

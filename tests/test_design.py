@@ -235,6 +235,16 @@ def test_rotations_are_smooth_at_none():
     np.testing.assert_allclose(both, [[-1, -2, 3], [1, 2, 3]], atol=1e-14)
 
 
+@pytest.mark.parametrize("angle", [1e3, 1e6, 1e9])
+def test_rotations_by_many_turns(angle):
+    x = jnp.array([1.0, 2.0, 3.0])
+    turned = js.rigid_motion(x, (jnp.array([0.0, 0.0, angle]), jnp.zeros(3)))
+    cos, sin = np.cos(angle), np.sin(angle)
+    exact = [cos - 2 * sin, sin + 2 * cos, 3]
+    # An angle is known to its round-off.
+    np.testing.assert_allclose(turned, exact, atol=1e-14 * angle)
+
+
 def test_single_precision():
     single = lambda tree: jax.tree.map(lambda a: a.astype(jnp.float32), tree)
     cloud = js.PointCloud(single(ball().cloud.points), single(ball().cloud.normals))

@@ -260,3 +260,17 @@ def test_data_that_the_model_misses_do_not_take_steps_to_and_fro():
     # Steps that are only halved: 209.
     assert found.converged and len(found.history["energy"]) < 15
     assert jnp.abs(rate(found.theta)).max() < 1e-5
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e8])
+def test_steps_of_first_order_converge_in_any_unit(unit):
+    """Of an unknown without a prior, whose derivative may be as small as one likes."""
+    exact = decay(1.5)
+    ask = lambda start: js.solve_inverse(
+        lambda q: (q / unit) * exact, start, 2 * exact, noise=0.01, optimizer=optax.lbfgs()
+    )
+    found = ask(jnp.array(unit))
+    assert found.converged
+    assert abs(found.theta / unit - 2) < 1e-4
+    # Where it begins at the likeliest there is nothing left to measure by.
+    assert ask(found.theta).converged

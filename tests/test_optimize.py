@@ -4,6 +4,7 @@ import functools
 import sys
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -115,6 +116,13 @@ def test_far_from_the_constraint_it_has_not_converged():
         )  # fmt: skip
         assert found.converged and found.history["gradient"][-1] < 2e-3
         np.testing.assert_allclose(found.theta, np.sqrt(2), rtol=1e-4)
+
+
+def test_an_objective_that_theta_does_not_move_has_not_converged():
+    shape = js.MappedShape(scaled, ball())
+    still = lambda surface: jax.lax.stop_gradient(surface.areas.sum())
+    found = js.optimize_shape(still, shape, jnp.ones(3), optimizer=ADAM, steps=3)
+    assert not found.converged and found.stopped == "the gradient vanishes at the first theta"
 
 
 def test_a_fold_on_the_way_is_no_contradiction():

@@ -299,6 +299,9 @@ class Loop(NamedTuple):
     def ended(self, run: _Run) -> str:
         """Why it ends here, if it does."""
         steps, off = int(run.step), float(run.values.violation)
+        nothing = float(run.history["gradient"][0]) == 0 and float(run.values.size) == 0
+        if steps == 0 and nothing and not (run.values.equalities | run.values.inequalities):
+            return "the gradient vanishes at the first theta"
         if _is_small(run, self.numbers["rtol"]) and off <= self.numbers["ctol"]:
             return "converged"
         if steps < self.numbers["steps"]:

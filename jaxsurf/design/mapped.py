@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -169,6 +170,8 @@ def _check_onto(found, points, normals) -> None:
     raise_at(~(cosine > 0), text, cosine)
 
 
+# Terms of the series of a rotation, which are less than the last digit for angles below 1.
+_TERMS = 9
 # Newton steps back to the reference: points move by a fifth of the spacing at a time.
 _PULLS = 3
 
@@ -228,7 +231,21 @@ def rigid_motion(
     turn = as_float(turn, "rotation", () if len(x) == 2 else (3,))
     shift = as_float(shift, "shift", x.shape)
     if len(x) == 2:
-        matrix = jnp.array([[0.0, -1.0], [1.0, 0.0]], turn.dtype) * turn
-    else:
-        matrix = jnp.cross(turn, jnp.eye(3, dtype=turn.dtype)).T
-    return jax.scipy.linalg.expm(matrix) @ x + shift
+        cos, sin = jnp.cos(turn), jnp.sin(turn)
+        return jnp.stack([cos * x[0] - sin * x[1], sin * x[0] + cos * x[1]]) + shift
+    once = jnp.cross(turn, x)
+    first, second = _rodrigues(jnp.sum(turn**2))
+    return x + first * once + second * jnp.cross(turn, once) + shift
+
+
+def _rodrigues(s):
+    r"""$\sin a / a$ and $(1 - \cos a) / a^2$ of the square of an angle: smooth at 0 too."""
+    near = s < 1
+    small, a = jnp.where(near, s, 0), jnp.sqrt(jnp.where(near, 1, s))
+
+    def series(start: int):
+        terms = [(-1) ** k / math.factorial(2 * k + start) for k in range(_TERMS)]
+        return jnp.polyval(jnp.array(terms[::-1], s.dtype), small)
+
+    first = jnp.where(near, series(1), jnp.sin(a) / a)
+    return first, jnp.where(near, series(2), (1 - jnp.cos(a)) / a**2)

@@ -102,6 +102,22 @@ def in_sight(problem: Problem, theta) -> tuple[Problem, PyTree]:
     return problem, strong(problem.whitened(theta))
 
 
+def told_units(problem: Problem, now: Seen) -> PyTree:
+    """What the gradient in each unknown is measured in, at the first theta.
+
+    With a prior it is without a unit. Without one, the deviation that data would tell if they
+    changed with the unknowns as the gradient says: by no less, for the residual that there is.
+    """
+    size = jnp.sqrt(jnp.sum(now.residual**2))
+
+    def unit(prior, slope):
+        along = jnp.sqrt(jnp.sum(slope**2))
+        told = size / jnp.where(along > 0, along, 1)
+        return jnp.where((along > 0) & (prior is None), told, 1).astype(slope.dtype)
+
+    return each(unit, problem.prior, now.gradient)
+
+
 def told_apart(columns: np.ndarray, where: str, *, scaled: bool = False) -> np.ndarray:
     """How much data change with each unknown without a prior.
 

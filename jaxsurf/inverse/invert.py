@@ -17,7 +17,7 @@ from ..arguments import as_float, floating, further, instance, real, whole
 from ..design.lagrangian import started, strong
 from ..design.outcome import OptimizationError
 from ..failures import needs_values
-from .asked import in_sight, priors, refuse, with_noise
+from .asked import in_sight, priors, refuse, told_units, with_noise
 from .posterior import Posterior, posterior_of
 from .priors import AbstractPrior
 from .problem import (
@@ -146,7 +146,8 @@ def solve_inverse(
         linear_steps: of conjugate gradients a step, at most.
         tol: it has converged where the step of Gauss and Newton (of first order: the gradient) is
             this many standard deviations of the posterior long. If None 1e-3, in single precision
-            0.05.
+            0.05. Of first order, unknowns without a prior have no deviations to begin with: those
+            are estimated from the gradient and the misfit at the first theta.
         throw: raise where it cannot go on; if False, see `stopped`.
 
     Returns:
@@ -213,7 +214,7 @@ def _run(problem, theta, optimizer, steps, linear_steps, tol) -> tuple[Inversion
     if optimizer is None:
         problem, xi = in_sight(problem, theta)
     if optimizer is not None:
-        state = started(optimizer, xi)
+        state, units = started(optimizer, xi), told_units(problem, now)
     first, forcing, stopped, failed = 0.0, _FORCING, "", False
 
     def note(size, decrement, linear=0, shortened=0):
@@ -224,6 +225,7 @@ def _run(problem, theta, optimizer, steps, linear_steps, tol) -> tuple[Inversion
 
     linear, shortened, before, share = 0, 0, None, 1.0
     while not stopped:
+        missed = float(jnp.mean(now.residual**2)) > _MISSED
         if optimizer is None:
             step, gradient, falls, linear = newton(
                 problem, xi, np.asarray(forcing), np.asarray(linear_steps)
@@ -235,12 +237,14 @@ def _run(problem, theta, optimizer, steps, linear_steps, tol) -> tuple[Inversion
             before = *after, step
         else:
             step, state = descent(optimizer, problem, xi, now, state)
-            size = decrement = size_of(now.gradient)
-            falls = None
+            size, falls = size_of(jax.tree.map(jnp.multiply, units, now.gradient)), None
+            # A first theta that is the likeliest has no gradient by which to measure others.
+            at_rest = not (rows["energy"] or missed)
+            decrement = size_of(now.gradient) if at_rest else size
         first = first or float(size)
         forcing = min(_FORCING, max(float(size) / max(first, 1e-300), 1e-12) ** 0.5)
         note(size, decrement, linear, shortened)
-        if float(size) == 0 and len(rows["energy"]) == 1 and rows["misfit"][0] > _MISSED:
+        if float(size) == 0 and len(rows["energy"]) == 1 and missed:
             stopped = "the derivative of J vanishes at the first theta, where data are missed"
             failed = True
         elif float(decrement) <= tol:

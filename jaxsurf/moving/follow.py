@@ -25,6 +25,7 @@ from ..renew import NeighborSearch
 from ..time.checkpoint import Checkpoint, digest, read_back, written
 from ..time.integrate import IntegrationError, integrate
 from ..time.run import planned
+from ..time.saving import AbstractCondition
 from .adaptation import Adaptation, changed, conserved
 from .contact import Contact, watched
 from .problem import Moving, fitted_normals, joined, parted
@@ -257,8 +258,7 @@ class _Run:
                 raise
             return error.solution, np.asarray(error.time, self.t.dtype), error.state
         assert solution.ts is not None and solution.ys is not None
-        _seen(solution.ys)
-        return solution, solution.ts[-1], jax.tree.map(lambda y: y[-1], solution.ys)
+        return solution, solution.ts[-1], jax.tree.map(lambda y: y[-1], _seen(solution.ys))
 
     def next_change(self):
         """When points are looked at whatever they have done: at multiples of a time from the start,
@@ -371,7 +371,7 @@ def _velocity(moving: Moving, t, state, args) -> Float[Array, "n d"]:
     return moving.rate(t, state, args)[0]
 
 
-class _Worn(eqx.Module):
+class _Worn(AbstractCondition):
     """True once lists do not serve well, from where the points were when they were found.
 
     Args:

@@ -118,13 +118,18 @@ class Moving(AbstractEvolution):
             changes += [problem.rate(t, fields, args), dilution]
         if self.motion.slides:
             slide = self.motion.sliding(t, surface, fields, args)
+            name = f"sliding of {type(self.motion).__name__}"
+            slide = as_float(slide, name, points.shape).astype(points.dtype)
             passed = lambda u: jnp.einsum("nx,n...x->n...", slide, surface.gradient(u))
             changes, velocity = [*changes, jax.tree.map(passed, fields)], velocity + slide
         return self._free(joined(velocity, jax.tree.map(lambda *each: sum(each), *changes)))
 
     def at(self, t, u):
-        surface = self.surface_at(u[0])
-        problem = None if self.on is None else numbers_as_arrays(self.on(surface))
+        points, fields = parted(u)
+        surface, problem = self.surface_at(points), None
+        if self.on is not None:
+            problem = self.on(surface)
+            problem = numbers_as_arrays(problem.at(t, problem.closed(t, fields)))
         frozen = self.motion.pull(surface), problem
         parts = lambda moving: (moving.pull, moving.problem)
         return eqx.tree_at(parts, self, frozen, is_leaf=lambda x: x is None)

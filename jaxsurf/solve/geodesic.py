@@ -87,7 +87,9 @@ def geodesic_distance(
     curves, 1e-2 with 200 even or graded points; on 300 random points of a circle, whose gaps are up
     to six spacings, 5e-2 to 0.4. Not yet shown for methods above second order.
     In float32 within 1e-4 of that, in l2 (`test_single_precision` there).
-    Differentiable: forward and reverse, in points and normals, for fixed neighbours.
+    Differentiable: forward and reverse, in points and normals, for fixed neighbours. Where two ways
+        are the shortest there is a crease, and no derivative: at such points (opposite the source
+        on a circle, say) what is given hangs on round-off.
     Raises:
         ValueError: no source; a source that is no point; a point that no path leads to.
         RuntimeError: a linear solve failed.

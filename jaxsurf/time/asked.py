@@ -19,6 +19,9 @@ from .higher import WaveEquation
 from .problem import AbstractEvolution
 from .states import dtype_of, only_on
 
+# So many units of round-off a length of time has at least.
+_RESOLVED = 4
+
 
 def checked_state(problem: AbstractEvolution, u0: Any) -> PyTree[Array]:
     """The state as arrays of floating-point numbers.
@@ -66,11 +69,20 @@ def checked_times(problem: AbstractEvolution, u0, t0, t1, dt0):
     for name, value in (("t0", t0), ("t1", t1), ("dt0", dt0)):
         if value is not None or name != "dt0":
             real(value, name)
+    apart = is_concrete(t0, t1) and t0 != t1
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     dt0 = None if dt0 is None else jnp.asarray(dt0, dtype)
     if not is_concrete(t0, t1):
         return t0, t1, dt0
     start, end = float(t0), float(t1)
+    told = float(_RESOLVED * jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
+    for what, length in (("from t0 to t1", abs(end - start)), ("of a step dt0", dt0)):
+        if length is not None and apart and is_concrete(length) and abs(float(length)) < told:
+            raise ValueError(
+                f"the time {what}, {abs(float(length)):g}, is lost in t0 = {start:g} and t1 = "
+                f"{end:g} in {dtype.name}, which tells times {told:.2g} apart: count from "
+                "t0 = 0, or use float64"
+            )
     if end < start and problem.diffusive:
         raise ValueError(
             f"t1 = {end:g} is before t0 = {start:g}: diffusion backwards in time has no solution"

@@ -2,6 +2,7 @@ r"""Long runs in parts: a file after each, and on from the file later."""
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import re
@@ -139,7 +140,7 @@ def integrate_in_parts(
                 break
             written(path, key, now)
             bar.update()
-    return _joined(solution, now, times, asked, reached, last, sub, run.args)
+    return _joined(solution, now, times, asked, reached, last, sub, run)
 
 
 def _single(saveat: dfx.SaveAt) -> dfx.SubSaveAt:
@@ -151,13 +152,16 @@ def _single(saveat: dfx.SaveAt) -> dfx.SubSaveAt:
 
 
 def _joined(
-    solution, now: _Progress, times, asked, reached, last: float, sub, args
+    solution, now: _Progress, times, asked, reached, last: float, sub, run: Run
 ) -> dfx.Solution:
     """What one call without parts would have returned."""
     ts = np.where(reached, times, np.inf)
+    for into in jax.tree.leaves(now.saved):
+        if np.issubdtype(into.dtype, np.inexact):
+            into[~reached] = np.inf
     if sub.t1:  # the end may have come early
         ts[-1] = last
-        final = sub.fn(last, jax.tree.map(jnp.asarray, now.state), args)
+        final = sub.fn(last, jax.tree.map(jnp.asarray, now.state), run.args)
         for into, found in zip(jax.tree.leaves(now.saved), jax.tree.leaves(final)):
             into[-1] = np.asarray(found)
     stats = {name: jnp.asarray(value) for name, value in zip(_COUNTS, now.counts)}
@@ -165,7 +169,7 @@ def _joined(
     if solution is not None:
         stats, result = solution.stats | stats, solution.result
     return dfx.Solution(
-        t0=jnp.asarray(times[0]), t1=jnp.asarray(times[-1]), ts=jnp.asarray(ts[asked]),
+        t0=run.t0, t1=run.t1, ts=jnp.asarray(ts[asked], run.t0.dtype),
         ys=jax.tree.map(lambda y: jnp.asarray(y[asked]), now.saved), interpolation=None,
         stats=stats, result=result, solver_state=None, controller_state=None, made_jump=None,
         event_mask=None if solution is None else solution.event_mask,
@@ -194,18 +198,34 @@ def digest(content: PyTree, within: tuple = ()) -> str:
 
 
 def _described(value: Any, within: tuple) -> str:
-    """Something that is no array, with the code and the surroundings of a function.
+    """Something that is no array, with the code and the surroundings of what can be called.
 
-    What functions read of their module is not among these: where it counts, the caller adds the
-    program that they are (`functions.canonical`).
+    Of what functions read of their module numbers are among these. Where all of it counts, the
+    caller adds the program that they are (`functions.canonical`).
     """
-    code = getattr(value, "__code__", None)
-    if code is None or any(value is other for other in within):
+    inside = None if any(value is other for other in within) else _inside(value)
+    if inside is None:
         return _without_addresses(repr(value))
-    cells = [cell.cell_contents for cell in value.__closure__ or ()]
-    inside = (cells, value.__defaults__, getattr(value, "__self__", None))
-    known = digest(inside, (*within, value))
-    return _without_addresses(f"{value.__qualname__}{_told(code)}{known}")
+    text, parts = inside
+    return _without_addresses(f"{text}{digest(parts, (*within, value))}")
+
+
+def _inside(value: Any) -> tuple[str, PyTree] | None:
+    """What something that can be called is made of, as text and as more of the kind."""
+    if isinstance(value, functools.partial):
+        return "partial", (value.func, value.args, value.keywords)
+    code, kind = getattr(value, "__code__", None), type(value)
+    if code is not None:
+        cells = [cell.cell_contents for cell in value.__closure__ or ()]
+        names = getattr(value, "__globals__", {})
+        read = {name: names[name] for name in code.co_names if eqx.is_array_like(names.get(name))}
+        parts = cells, value.__defaults__, getattr(value, "__self__", None), read
+        return f"{value.__qualname__}{_told(code)}", parts
+    if callable(getattr(value, "__wrapped__", None)):  # by `jax.jit`, say
+        return kind.__qualname__, value.__wrapped__
+    if callable(value) and not isinstance(value, type) and hasattr(value, "__dict__"):
+        return kind.__qualname__, (vars(value), kind.__call__)
+    return None
 
 
 def _told(code: CodeType) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
@@ -20,8 +19,8 @@ from ..solutions import told
 from .checkpoint import Checkpoint, integrate_in_parts
 from .problem import AbstractEvolution
 from .run import Plan, Run, planned, solve
+from .saving import SteadyState, between_steps
 from .stability import Verdict
-from .states import root_mean_square
 
 
 class IntegrationError(RuntimeError):
@@ -162,19 +161,7 @@ def steady_state(*, rtol: float = 1e-4, atol: float = 1e-6) -> dfx.Event:
     """
     real(rtol, "rtol", least=0, below=1)
     real(atol, "atol", least=0)
-    return dfx.Event(_Steady(numbers_as_arrays(rtol), numbers_as_arrays(atol)))
-
-
-class _Steady(eqx.Module):
-    """True where the rate is small. Its numbers are leaves: others compile nothing."""
-
-    rtol: Array
-    atol: Array
-    norm: Callable = root_mean_square
-
-    def __call__(self, t, y, args, *, terms, solver, **_):
-        rate = solver.func(terms, t, y, args)
-        return self.norm(rate) < self.atol + self.rtol * self.norm(y)
+    return dfx.Event(SteadyState(numbers_as_arrays(rtol), numbers_as_arrays(atol)))
 
 
 # --- what came of it -----------------------------------------------------------------------
@@ -191,6 +178,7 @@ def _finished(plan: Plan, run: Run, throw: bool) -> dfx.Solution:
         stats["summary"] = _summary(plan, solution, float(t_last))
     else:
         stats.pop("max_steps")  # nothing but a number of ours
+    solution = between_steps(solution, plan.filled)
     solution = eqx.tree_at(
         lambda s: (s.ts, s.ys, s.stats), solution, (ts, ys, stats), is_leaf=lambda x: x is None
     )

@@ -3,7 +3,6 @@ r"""What an integration consists of: terms, solver and controller that go togeth
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -31,6 +30,7 @@ from .guard import Guard, guarded
 from .loops import COPIES, RecursiveCheckpoints, count_steps, most_steps
 from .phases import Linear, Rest, frozen, has_phases
 from .problem import AbstractEvolution, checked_problem
+from .saving import closed_saves, ending, filling, stores_steps
 from .stability import Verdict, check_steps
 from .states import Norm, root_mean_square
 
@@ -130,12 +130,14 @@ class Plan(NamedTuple):
         name: of the solver.
         why: it was chosen.
         concrete: nothing is traced, so that results can be looked at.
+        filled: what fills in boundary values between steps.
     """
 
     run: Run
     name: str
     why: str
     concrete: bool
+    filled: Traced | None
 
 
 @eqx.filter_jit
@@ -211,23 +213,25 @@ def planned(
     now = (t0, u0, args)
     terms = _terms(arrays, solver, now)
     controller = _with_arrays(controller)
-    if event is not None and is_concrete(t0, t1) and t1 > t0:
+    if event is not None:
         told = dict(
             terms=terms, solver=solver, t0=t0, t1=t1, dt0=dt0, saveat=saveat,
             stepsize_controller=controller, max_steps=allowed,
         )  # fmt: skip
-        event = _ending(event, arrays, now, told)
-    saveat = _saving(saveat, arrays, now)
+        event = ending(event, arrays, now, told)
+    filled = filling(arrays, saveat, now)
+    saveat = closed_saves(saveat, arrays, now)
     limit = _limit(*constant((u0, jnp.asarray(problem._grows, t0.dtype), t0, t1)))
     parts = (terms, solver, t0, t1, dt0, u0, args, controller, limit, saveat, event, adjoint)
     concrete = is_concrete(parts)  # also not inside a `jit`, which would make the limit traced
     _log.info("%s over [%s, %s] by %s", type(problem).__name__, t0, t1, why)
     if not concrete and max_steps is None and type(controller) is dfx.ConstantStepSize:
         # What is stored at every step is as long as there may be steps.
-        allowed = allowed if _stores_steps(saveat) else most_steps(*times, allowed)
+        allowed = allowed if stores_steps(saveat) else most_steps(*times, allowed)
     throw = bool(throw) and not concrete and not is_marking()
     run = Run(*parts, allowed, bool(progress), throw)
-    return Plan(run, name, f"{name}: given" if why == "given" else why, concrete)
+    why = f"{name}: given" if why == "given" else why
+    return Plan(run, name, why, concrete, filled)
 
 
 def _check_estimates(solver: dfx.AbstractSolver, controller) -> None:
@@ -324,7 +328,7 @@ def _allowed(max_steps, saveat: dfx.SaveAt, t0, t1, dt0, controller) -> int:
     if given:
         max_steps = whole(max_steps, "max_steps", least=1)
     else:
-        max_steps = _STORED_STEPS if _stores_steps(saveat) else _MANY_STEPS
+        max_steps = _STORED_STEPS if stores_steps(saveat) else _MANY_STEPS
     adaptive = isinstance(controller, dfx.AbstractAdaptiveStepSizeController)
     steps = None if given or adaptive else count_steps(t0, t1, dt0)
     if steps is not None:
@@ -336,56 +340,3 @@ def _allowed(max_steps, saveat: dfx.SaveAt, t0, t1, dt0, controller) -> int:
         if steps > _MANY_STEPS / 10:
             warn(f"dt0 = {float(dt0):g} makes {steps:.3g} steps")
     return max_steps
-
-
-# --- what is saved, and what ends a run ----------------------------------------------------
-
-
-def _is_sub(x) -> bool:
-    return isinstance(x, dfx.SubSaveAt)
-
-
-def _stores_steps(saveat: dfx.SaveAt) -> bool:
-    subs = [s for s in jax.tree.leaves(saveat.subs, is_leaf=_is_sub) if _is_sub(s)]
-    return saveat.dense or any(sub.steps for sub in subs)
-
-
-_AS_IT_IS = dfx.SubSaveAt(t1=True).fn
-
-
-def closed(problem: AbstractEvolution, what: Callable, now) -> Callable:
-    """What is made of a state, from the state with its boundary values."""
-    if problem.closure is None and what is _AS_IT_IS:
-        return what
-    return canonical(lambda t, y, args: what(t, problem.closed(t, y), args), *now)
-
-
-def _saving(saveat: dfx.SaveAt, problem: AbstractEvolution, now) -> dfx.SaveAt:
-    """The same saves with boundary values filled in, and the last state in any case."""
-    new = lambda sub: eqx.tree_at(lambda s: s.fn, sub, closed(problem, sub.fn, now))
-    subs = jax.tree.map(new, saveat.subs, is_leaf=_is_sub)
-    last = new(dfx.SubSaveAt(t1=True))
-    return eqx.tree_at(lambda s: s.subs, saveat, (subs, last), is_leaf=lambda x: x is None)
-
-
-class _Ending(eqx.Module):
-    """A condition that ends a run, as a program."""
-
-    value: Callable
-
-    def __call__(self, t, y, args, **_):
-        return self.value(t, y, args)
-
-
-def _ending(event: dfx.Event, problem: AbstractEvolution, now, told: dict) -> dfx.Event:
-    """The event with its functions as programs, of the state with its boundary values."""
-
-    def new(condition):
-        if isinstance(condition, eqx.Module):  # has numbers of its own as leaves
-            if problem.active is not None and getattr(condition, "norm", None) is root_mean_square:
-                return eqx.tree_at(lambda c: c.norm, condition, Norm(jnp.asarray(problem.active)))
-            return condition
-        return _Ending(closed(problem, lambda t, y, args: condition(t, y, args, **told), now))
-
-    conditions = jax.tree.map(new, event.cond_fn, is_leaf=callable)
-    return eqx.tree_at(lambda e: e.cond_fn, event, conditions)

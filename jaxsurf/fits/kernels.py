@@ -25,9 +25,10 @@ def taper(s: Float[Array, "*q"]) -> Float[Array, "*q"]:
 def gaussian(r2: Float[Array, "*q"], width, radius, on=True) -> Float[Array, "*q"]:
     r"""$e^{-r^2/\epsilon^2}$ (Singh et al. 2023, eq. 5), tapered to zero at the radius.
 
-    Zero also where `on` is False.
+    Zero also where `on` is False, whatever stands there.
     """
-    return jnp.exp(-r2 / width**2) * jnp.where(on, taper(r2 / radius**2), 0)
+    s = r2 / radius**2
+    return jnp.where(on & (s < 1), jnp.exp(-r2 / width**2) * taper(s), 0)
 
 
 @gaussian.defjvp
@@ -37,7 +38,8 @@ def _gaussian_jvp(primals, tangents):
 
     def logarithm(r2, width, radius):
         s = r2 / radius**2
-        return 3 * jnp.log(1 - jnp.where(on & (s < 1), s, 0) ** 4) - r2 / width**2
+        inside = on & (s < 1)
+        return jnp.where(inside, 3 * jnp.log(1 - jnp.where(inside, s, 0) ** 4) - r2 / width**2, 0)
 
     value = gaussian(*primals)
     return value, value * jax.jvp(logarithm, lengths, tangents[:-1])[1]

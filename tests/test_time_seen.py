@@ -139,6 +139,19 @@ class Thinning(js.AbstractEvolution):
         return -u
 
 
+class Fed(Thinning):
+    """With a source where it does not belong."""
+
+    def linear(self, t, u):
+        return super().linear(t, u) + 1
+
+
+def test_a_linear_part_that_is_not_linear_is_refused():
+    for solver in (js.IMEX(order=3), None):
+        with pytest.raises(ValueError, match=r"linear of Fed .* gives 1.0 at point 0"):
+            js.integrate(Fed(None, SURFACE.laplacian), Z, t1=0.5, solver=solver)
+
+
 def test_problems_on_moving_surfaces_have_two_phases():
     growth = js.Motion(lambda t, surface, fields, args: 0.3 * surface.cloud.normals)
     given = dict(t1=0.1, fields=0.5 * Z + 0.2, problem=lambda s: Thinning(None, s.laplacian))

@@ -166,6 +166,31 @@ def check_coefficients(problem: AbstractEvolution, t0, t1) -> None:
         problem.check(t1)
 
 
+def check_linear(problem: AbstractEvolution, t0, u0) -> None:
+    """Refuse a stiff part that is not linear, of problems of users' own: no step would be short
+    enough for solvers that take it for one.
+
+    Raises:
+        ValueError: it makes something of nothing.
+    """
+    ours = type(problem).linear.__module__.partition(".")[0] == __name__.partition(".")[0]
+    if ours or not is_concrete(problem, t0, u0):
+        return
+    text = (
+        f"linear of {type(problem).__name__} is not linear in the state: where that is zero it "
+        "gives {v} at point {i}, in place of 0. What does not depend on the state belongs to `rest`"
+    )
+    some = lambda x: (x != 0).reshape(len(x), -1).any(axis=1)
+    for leaf in jax.tree.leaves(_of_nothing(problem, t0, u0)):
+        check(leaf, some, text)
+
+
+@eqx.filter_jit
+def _of_nothing(problem: AbstractEvolution, t, u):
+    now = problem.at(t, problem.closed(t, u))
+    return now.implicit_rate(t, jax.tree.map(jnp.zeros_like, u), None)
+
+
 def check_tolerances(controller: dfx.AbstractStepSizeController, dtype) -> None:
     """Refuse those that no step meets: it would be tried ever shorter, for ever."""
     if not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):

@@ -18,6 +18,7 @@ from ..functions import Traced, canonical, constant, numbers_as_arrays
 from .amplification import AbstractAmplification, amplification_of
 from .asked import (
     check_coefficients,
+    check_linear,
     check_saves,
     check_tolerances,
     checked_rate,
@@ -212,6 +213,8 @@ def planned(
     arrays = numbers_as_arrays(problem)
     now = (t0, u0, args)
     terms = _terms(arrays, solver, now)
+    if _takes_two(solver):
+        check_linear(arrays, t0, u0)
     controller = _with_arrays(controller)
     if event is not None:
         told = dict(

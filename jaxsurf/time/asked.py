@@ -76,12 +76,16 @@ def checked_times(problem: AbstractEvolution, u0, t0, t1, dt0):
         return t0, t1, dt0
     start, end = float(t0), float(t1)
     told = float(_RESOLVED * jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
-    for what, length in (("from t0 to t1", abs(end - start)), ("of a step dt0", dt0)):
-        if length is not None and apart and is_concrete(length) and abs(float(length)) < told:
+    step = 0.0 if dt0 is None or not is_concrete(dt0) else abs(float(dt0))
+    for what, length, least in (
+        ("from t0 to t1", abs(end - start), -1),
+        ("of a step dt0", step, 0),
+    ):
+        if apart and least < length < told:
             raise ValueError(
-                f"the time {what}, {abs(float(length)):g}, is lost in t0 = {start:g} and t1 = "
-                f"{end:g} in {dtype.name}, which tells times {told:.2g} apart: count from "
-                "t0 = 0, or use float64"
+                f"the time {what}, {length:g}, is lost in t0 = {start:g} and t1 = {end:g} in "
+                f"{dtype.name}, which tells times {told:.2g} apart: count from t0 = 0, or use "
+                "float64"
             )
     if end < start and problem.diffusive:
         raise ValueError(

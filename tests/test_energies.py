@@ -140,6 +140,15 @@ def test_methods_whose_gradient_is_too_coarse_keep_the_values_of_the_laplacian()
     np.testing.assert_allclose(work, surface.inner(load, u), rtol=1e-8)
 
 
+def test_compliance_of_traced_lists_says_how_it_is_compiled():
+    surface = js.discretize(js.sphere(300), method=js.GFDM(degree=2))
+    points, load = surface.cloud.points, surface.cloud.points[:, 2]
+    with pytest.raises(ValueError, match=r"neighbours of the surface.*surface\.moved\(points\)"):
+        jax.jit(js.compliance)(surface, load)
+    found = jax.jit(lambda points: js.compliance(surface.moved(points), load))(points)
+    assert abs(found / js.compliance(surface, load) - 1) < 1e-9
+
+
 def test_compliance_where_round_off_ends_the_solve():
     """On a curve the condition grows with n², on a thin tube with its points along; both failed."""
     n = 1_000

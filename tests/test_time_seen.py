@@ -98,6 +98,8 @@ def test_what_a_checkpoint_did_not_reach_is_infinite(tmp_path):
         for checkpoint in (None, js.Checkpoint(tmp_path / "run", every=0.5))
     )
     assert np.isinf(plain.ys[-1]).all()
+    assert parts.stats["summary"].startswith("RKC2: ")
+    assert "to t = 0.2" in parts.stats["summary"]
     np.testing.assert_allclose(parts.ys, plain.ys, atol=1e-12)
     np.testing.assert_array_equal(parts.ts, plain.ts)
 
@@ -116,6 +118,8 @@ def test_a_condition_that_computes_something_else_is_another_run(tmp_path):
     first = js.integrate(HEAT, Z, checkpoint=checkpoint, **how)
     again = js.integrate(HEAT, Z, checkpoint=checkpoint, **how)
     np.testing.assert_array_equal(again.ts, first.ts)
+    assert again.stats["summary"] == first.stats["summary"]
+    assert again.stats["solver"] == first.stats["solver"]
     LEVEL[0] = 0.25
     with pytest.raises(ValueError, match="checkpoint of another run"):
         js.integrate(HEAT, Z, checkpoint=checkpoint, **how)

@@ -88,8 +88,9 @@ def compliance(
         once in points and normals, as `areas`.
     Raises:
         TypeError: what is no discretisation, a load or a screening that is not made of numbers.
-        ValueError: a load of another shape, a negative or traced screening, a surface with a border
-            (solve with `js.solve` and conditions there).
+        ValueError: a load of another shape, a negative or traced screening, traced neighbours (a
+            compiled function closes over the surface and moves it), a surface with a border (solve
+            with `js.solve` and conditions there).
         RuntimeError: the linear solve failed.
 
     Example:
@@ -99,6 +100,12 @@ def compliance(
         True
     """
     closed(surface)
+    needs_values(
+        "neighbours of the surface",
+        surface.neighbors.indices,
+        instead="let the function that is compiled close over the surface and move it, "
+        "lambda points: js.compliance(surface.moved(points), load)",
+    )
     f = finite(as_float(f, "load", (surface.n,)), "load", surface.cloud.active)
     f = switched_off(surface.cloud.active, f)
     real(screening, "screening", least=0)

@@ -86,8 +86,8 @@ class _Progress(NamedTuple):
 
 def integrate_in_parts(
     checkpoint: Checkpoint, plan: Plan, solve: Callable[[Run], dfx.Solution], progress: bool
-) -> dfx.Solution:
-    """One part after another.
+) -> tuple[dfx.Solution, float]:
+    """One part after another, and when the last ended.
 
     Args:
         checkpoint: where and how often.
@@ -140,7 +140,7 @@ def integrate_in_parts(
                 break
             written(path, key, now)
             bar.update()
-    return _joined(solution, now, times, asked, reached, last, sub, run)
+    return _joined(solution, now, times, asked, reached, last, sub, run), last
 
 
 def _single(saveat: dfx.SaveAt) -> dfx.SubSaveAt:

@@ -140,7 +140,9 @@ def integrate(
     if checkpoint is None:
         return told(_finished(plan, plan.run, throw))
     part = lambda run: _finished(plan, run, throw)
-    return told(integrate_in_parts(checkpoint, plan, part, progress))
+    solution, last = integrate_in_parts(checkpoint, plan, part, progress)
+    stats = solution.stats | dict(solver=plan.why, summary=_summary(plan, solution, last))
+    return told(eqx.tree_at(lambda s: s.stats, solution, stats))
 
 
 def steady_state(*, rtol: float = 1e-4, atol: float = 1e-6) -> dfx.Event:

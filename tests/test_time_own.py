@@ -105,6 +105,33 @@ def test_a_problem_of_ones_own_is_preconditioned():
     assert abs(float(one - other)) < 1e-6 * float(size)  # cycles run in single precision
 
 
+class Misfactored(Grown):
+    wrong: object
+
+    def factors(self, g, state):
+        return self.wrong(g)
+
+
+@pytest.mark.core
+@pytest.mark.parametrize(
+    "wrong", [lambda g: (None, g), lambda g: (None, jnp.ones((2, 3)) * g), lambda g: g[None]]
+)
+def test_factors_of_another_shape_are_named(wrong):
+    problem = Misfactored(None, SURFACE, None, jnp.asarray(GROWTH), wrong)
+    with pytest.raises(ValueError, match=r"factors of Misfactored have shapes .*expected \(m,\)"):
+        js.step_preconditioner(problem, (CLOUD.points, Z))
+
+
+@pytest.mark.core
+def test_a_preconditioner_of_other_points_is_named():
+    other = js.AdvectionDiffusionReaction(js.discretize(js.sphere(300)).laplacian)
+    inverse = js.step_preconditioner(other, jnp.zeros(300))
+    problem = js.AdvectionDiffusionReaction(SURFACE.laplacian)
+    for solver in (js.IMEX(preconditioner=inverse), js.SDIRK(preconditioner=inverse)):
+        with pytest.raises(ValueError, match=r"preconditioner is of .* \(300,\), .* \(200,\)"):
+            js.integrate(problem, Z, t1=0.1, dt0=0.05, solver=solver)
+
+
 @pytest.mark.core
 def test_what_was_passed_stays_readable():
     turn = jnp.cross(jnp.array([0.0, 0.0, 1.0]), CLOUD.points)

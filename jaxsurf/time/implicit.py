@@ -195,7 +195,7 @@ class IMEX(_Implicit):
         solver = relative(self.solver, self.tolerance, y0)
 
         tableau = self.tableau
-        options = _options(self.preconditioner, tableau.gamma * (t1 - t0))
+        options = _options(self.preconditioner, tableau.gamma * (t1 - t0), y0)
 
         def solve(t, known, start):
             def left_side(y):
@@ -275,7 +275,7 @@ class SDIRK(_Implicit):
         tolerance = tolerance_of(self.tolerance, y0)
 
         tableau = _SDIRK[self.scheme]
-        options = _options(self.preconditioner, tableau.gamma * (t1 - t0))
+        options = _options(self.preconditioner, tableau.gamma * (t1 - t0), y0)
 
         def solve(t, known, start):
             def residual(y):
@@ -316,9 +316,15 @@ class SDIRK(_Implicit):
         return _steps(tableau, (terms,), solve, (t0, t1), y0, args, solver_state, made_jump)
 
 
-def _options(preconditioner: Preconditioner | None, shift) -> dict:
+def _options(preconditioner: Preconditioner | None, shift, y0) -> dict:
     """For the linear solves of all stages of a step, whose matrices are the same but for f'."""
-    return {} if preconditioner is None else {"preconditioner": preconditioner(shift)}
+    if preconditioner is None:
+        return {}
+    inverse = preconditioner(shift)
+    wanted, given = (jax.tree.map(lambda a: a.shape, x) for x in (y0, inverse.in_structure()))
+    if given != wanted:
+        raise ValueError(f"preconditioner is of a state of shapes {given}, this one has {wanted}")
+    return {"preconditioner": inverse}
 
 
 # Residual of a Newton step's linear system over its right-hand side.

@@ -159,9 +159,27 @@ def _factored(problem, u0) -> tuple[Any, PyTree[Array], Callable]:
     t = jnp.zeros((), dtype_of(u0))
     now = problem.at(t, u0)
     factors = lambda g: now.factors(g, u0)
-    if getattr(now, "laplacian", None) is None or jax.eval_shape(factors, t) is None:
+    rows = jax.eval_shape(factors, t)
+    if getattr(now, "laplacian", None) is None or rows is None:
         raise ValueError(
             f"there is no preconditioner for problem = {type(problem).__name__}: it has no "
             "diffusion, or none known (no `laplacian` or no `factors`)"
         )
+    _check_factors(type(problem).__name__, rows, u0)
     return now, u0, canonical(factors, t)
+
+
+def _check_factors(name: str, rows: PyTree, u0: PyTree[Array]) -> None:
+    """As `AbstractEvolution.factors` says."""
+
+    def fits(row, leaf) -> bool:
+        return row is None or row.ndim == 1 or (row.ndim == 2 and row.shape[1:] == leaf.shape[1:])
+
+    leaves, structure = jax.tree.flatten(u0)
+    given, kind = jax.tree.flatten(rows, is_leaf=lambda row: row is None)
+    if kind != structure or not all(map(fits, given, leaves)):
+        shapes = (jax.tree.map(lambda a: a.shape, tree) for tree in (rows, u0))
+        raise ValueError(
+            f"factors of {name} have shapes {next(shapes)}, expected (m,), (m, c) for c species, "
+            f"or None for each array of the state, of shapes {next(shapes)}"
+        )

@@ -175,9 +175,10 @@ def _check_factors(name: str, rows: PyTree, u0: PyTree[Array]) -> None:
     def fits(row, leaf) -> bool:
         return row is None or row.ndim == 1 or (row.ndim == 2 and row.shape[1:] == leaf.shape[1:])
 
-    leaves, structure = jax.tree.flatten(u0)
-    given, kind = jax.tree.flatten(rows, is_leaf=lambda row: row is None)
-    if kind != structure or not all(map(fits, given, leaves)):
+    none = lambda row: row is None
+    wanted: Any = jax.tree.structure(u0)
+    same = wanted == jax.tree.structure(rows, is_leaf=none)
+    if not (same and all(map(fits, jax.tree.leaves(rows, is_leaf=none), jax.tree.leaves(u0)))):
         shapes = (jax.tree.map(lambda a: a.shape, tree) for tree in (rows, u0))
         raise ValueError(
             f"factors of {name} have shapes {next(shapes)}, expected (m,), (m, c) for c species, "

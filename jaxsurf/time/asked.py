@@ -19,7 +19,7 @@ from .higher import WaveEquation
 from .problem import AbstractEvolution
 from .states import dtype_of, only_on
 
-# So many units of round-off a length of time has at least.
+# So many units of round-off a step has at least.
 _RESOLVED = 4
 
 
@@ -75,18 +75,17 @@ def checked_times(problem: AbstractEvolution, u0, t0, t1, dt0):
     if not is_concrete(t0, t1):
         return t0, t1, dt0
     start, end = float(t0), float(t1)
+    if apart and start == end:
+        raise ValueError(
+            f"t0 and t1 are {start:g} both in {dtype.name}, the precision of the state: count from "
+            "t0 = 0, or use float64"
+        )
     told = float(_RESOLVED * jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
-    step = 0.0 if dt0 is None or not is_concrete(dt0) else abs(float(dt0))
-    for what, length, least in (
-        ("from t0 to t1", abs(end - start), -1),
-        ("of a step dt0", step, 0),
-    ):
-        if apart and least < length < told:
-            raise ValueError(
-                f"the time {what}, {length:g}, is lost in t0 = {start:g} and t1 = {end:g} in "
-                f"{dtype.name}, which tells times {told:.2g} apart: count from t0 = 0, or use "
-                "float64"
-            )
+    if dt0 is not None and is_concrete(dt0) and 0 < abs(float(dt0)) < told:
+        raise ValueError(
+            f"dt0 = {float(dt0):g} is lost in times from {start:g} to {end:g}, which {dtype.name} "
+            f"tells {told:.2g} apart: count from t0 = 0, or use float64"
+        )
     if end < start and problem.diffusive:
         raise ValueError(
             f"t1 = {end:g} is before t0 = {start:g}: diffusion backwards in time has no solution"

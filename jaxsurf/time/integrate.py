@@ -112,7 +112,7 @@ def integrate(
             given length that are explicit, in part or whole, beyond the limit of stability (with
             step, limit and spectral radius; of a rate that depends on time at six times); diffusion
             backwards in time; a border about which nothing is said; tolerances out of range; times
-            that are apart by less than the precision of the state tells; a linear part of a problem
+            or steps that are lost in the precision of the state; a linear part of a problem
             of one's own that is not linear; a checkpoint that is of another run or damaged.
         IntegrationError: the end was not reached: the solution diverges (or grows a hundredfold
             where the equation lets none grow), the tolerance cannot be met, a linear system does

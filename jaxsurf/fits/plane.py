@@ -41,8 +41,13 @@ class Neighborhood(eqx.Module):
 
     @Kept
     def squared(self) -> Float[Array, "k *p"]:
-        """Squared distances from the centre."""
-        return dot(self.offsets, self.offsets)
+        """Squared distances from the centre.
+
+        Stored, as those that are found again may differ in the last bit: the derivative of the
+        largest looks for that which is equal to it.
+        """
+        never = self.normals[(0,) * self.normals.ndim] > 2
+        return stored(dot(self.offsets, self.offsets), never)
 
 
 class TangentPlane(eqx.Module):

@@ -82,6 +82,7 @@ class TangentPlane(eqx.Module):
             # The compiler would find the factors again for every use of their product.
             weights = stored(gaussian(around.squared, unit, radius, around.mask), unit[0] < 0)
             plane = cls.at(around.normals[0], around.offsets, weights, unit, radius)
+            # For accelerators: on a CPU the compiler looks through it.
             return jax.lax.optimization_barrier(plane)
 
         return once(around, (width, support), seen)

@@ -23,6 +23,11 @@ from .states import dtype_of, only_on
 _RESOLVED = 4
 
 
+def resolved(t0: Array, t1: Array) -> Array:
+    """A step that is not lost in the times of a run."""
+    return _RESOLVED * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+
+
 def checked_state(problem: AbstractEvolution, u0: Any) -> PyTree[Array]:
     """The state as arrays of floating-point numbers.
 
@@ -80,11 +85,10 @@ def checked_times(problem: AbstractEvolution, u0, t0, t1, dt0):
             f"t0 and t1 are {start:g} both in {dtype.name}, the precision of the state: count from "
             "t0 = 0, or use float64"
         )
-    told = float(_RESOLVED * jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
-    if dt0 is not None and is_concrete(dt0) and 0 < abs(float(dt0)) < told:
+    if dt0 is not None and is_concrete(dt0) and 0 < abs(float(dt0)) < resolved(t0, t1):
         raise ValueError(
             f"dt0 = {float(dt0):g} is lost in times from {start:g} to {end:g}, which {dtype.name} "
-            f"tells {told:.2g} apart: count from t0 = 0, or use float64"
+            f"tells {resolved(t0, t1):.2g} apart: count from t0 = 0, or use float64"
         )
     if end < start and problem.diffusive:
         raise ValueError(

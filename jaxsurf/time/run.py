@@ -24,6 +24,7 @@ from .asked import (
     checked_rate,
     checked_state,
     checked_times,
+    resolved,
 )
 from .chebyshev import Loop
 from .explicit import RKC2
@@ -315,8 +316,7 @@ def _limit(u0, growth, t0: Array, t1: Array) -> Array:
 @jax.jit
 def _shortest(t0: Array, t1: Array) -> Array:
     """A step that is not worth trying: much shorter than all, or lost in the time."""
-    lost = 4 * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-    return jnp.maximum(_SHORTEST * jnp.abs(t1 - t0), lost)
+    return jnp.maximum(_SHORTEST * jnp.abs(t1 - t0), resolved(t0, t1))
 
 
 def _with_arrays(controller: dfx.AbstractStepSizeController):

@@ -172,16 +172,23 @@ def code_of(cloud, neighbors, found_at, found, residual):
 
 @sized_jit
 def stretch(before, after, neighbors):
-    """By which factor neighbourhoods have grown: the root of mean squared distances; 1 if empty."""
+    """By which factor neighbourhoods have grown, and the least by which two points came apart.
 
-    def squared(sums, slot):
+    The root of mean squared distances, and the least of all; 1 of points without neighbours.
+    """
+
+    def squared(found, slot):
         index, used = slot
-        far = (jnp.where(used, jnp.sum((x[index] - x) ** 2, axis=1), 0) for x in (before, after))
-        return jax.tree.map(jnp.add, sums, tuple(far)), None
+        old, new = (jnp.sum((x[index] - x) ** 2, axis=1) for x in (before, after))
+        sums = (sum_ + jnp.where(used, d, 0) for sum_, d in zip(found, (old, new)))
+        least = jnp.where(used & (old > 0), new / jnp.where(old > 0, old, 1), 1)
+        return (*sums, jnp.minimum(found[2], least)), None
 
     zero = jnp.zeros(len(after), after.dtype)
-    old, new = jax.lax.scan(squared, (zero, zero), (neighbors.indices.T, neighbors.mask.T))[0]
-    return jnp.where(old > 0, jnp.sqrt(new / jnp.where(old > 0, old, 1)), 1)
+    slots = (neighbors.indices.T, neighbors.mask.T)
+    old, new, least = jax.lax.scan(squared, (zero, zero, zero + 1), slots)[0]
+    grown = jnp.where(old > 0, jnp.sqrt(new / jnp.where(old > 0, old, 1)), 1)
+    return grown, jnp.sqrt(least)
 
 
 def raise_for(code: np.ndarray) -> None:

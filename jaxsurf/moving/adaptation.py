@@ -2,6 +2,7 @@ r"""Points added in holes and merged where they crowd, with fields on them."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
+from scipy.spatial import cKDTree
 
 from ..arguments import as_float, finite, flag, instance, real, switched_off, whole
 from ..compiling import on_device
@@ -21,6 +23,8 @@ from .rows import Rows, compact, exchanged
 
 # Each round fills the largest holes that do not touch, so the number of points may triple in it.
 _ROUNDS = 30
+# Of the polynomials where those of the operators swing.
+_LOWER = 2
 
 
 class Adaptation(eqx.Module):
@@ -191,18 +195,21 @@ def changed(
     rows, added, merged = Rows.of(surface, fields, spacing), 0, 0
     for _ in range(_ROUNDS):
         found = _sought(surface, rows, adaptation)
-        pairs, new = found.pairs, len(found.feet) + len(found.holes)
-        if not len(pairs) + new:
+        pairs = found.pairs
+        if not len(pairs) + len(found.feet) + len(found.holes):
             return surface, rows.fields, added, merged
-        added, merged = added + new, merged + len(pairs)
         try:
-            coming = _placed(surface, rows, found)
+            coming = _placed(surface, rows, found, adaptation.closest)
         except ValueError as error:
             left = int(surface.cloud.host_active.sum())
             raise ValueError(
                 f"no points can be added or merged where {left} are left: the spacing wanted may "
                 f"be too large for the surface and the degree of its method ({error})"
             ) from error
+        new = len(coming.points) - len(pairs)
+        if not len(pairs) + new:
+            return surface, rows.fields, added, merged
+        added, merged = added + new, merged + len(pairs)
         surface, rows = exchanged(surface, rows, pairs.ravel(), coming, adaptation.capacity)
     raise ValueError(
         f"{new} holes and {len(pairs)} crowded pairs of points are left after {_ROUNDS} "
@@ -240,7 +247,7 @@ def _sought(surface: Discretization, rows: Rows, adaptation: Adaptation) -> _Sou
     return _Sought(pairs, feet, normals, holes, wanted)
 
 
-def _placed(surface: Discretization, rows: Rows, found: _Sought) -> Rows:
+def _placed(surface: Discretization, rows: Rows, found: _Sought, closest: float) -> Rows:
     """One point for each pair, and one for each gap and hole."""
     cloud, x, rank = surface.cloud, np.asarray(rows.points), np.asarray(rows.rank)
     pairs, edge = found.pairs, slice(len(found.pairs), len(found.pairs) + len(found.feet))
@@ -248,14 +255,25 @@ def _placed(surface: Discretization, rows: Rows, found: _Sought) -> Rows:
     stays = rank[pairs[:, :1]] > 0
     kept = np.where(stays, x[pairs[:, 0]], np.mean(x[pairs], axis=1))
     at = np.concatenate([kept, found.feet, found.holes])
-    degree, arrays = surface.method.polynomial_degree, (cloud.points, cloud.normals, rows.fields)
-    points, normals, fields = _interpolated(cloud, surface.neighbors, degree, at, arrays)
+    arrays = cloud.points, cloud.normals, rows.fields
+    made = _interpolated(surface, surface.method.polynomial_degree, at, arrays)
+    # Where the points do not resolve a surface its polynomials swing, the more the higher their
+    # degree, and a point that lands on another would be merged with it, and come again.
+    tree, near = cKDTree(x[cloud.host_active]), closest * found.spacing[len(found.feet) :]
+    lands = lambda points: edge.stop + np.flatnonzero(tree.query(points[edge.stop :])[0] < near)
+    if len(swung := lands(made[0])):
+        lower = _interpolated(surface, _LOWER, at[swung], arrays)
+        made = jax.tree.map(functools.partial(_put, swung), made, lower)
+    points, normals, fields = made
     points[edge], normals[edge] = found.feet, found.normals
     merged = np.minimum(*np.asarray(rows.spacing)[pairs].T)
     spacing = np.concatenate([merged, found.spacing]).astype(rows.spacing.dtype)
     ranks = np.zeros(len(at), rank.dtype)
     ranks[: len(pairs)], ranks[edge] = rank[pairs[:, 0]], 1
-    return Rows(*jax.tree.map(on_device, (points, normals, fields, spacing, ranks)))
+    # Where it still lands on another there is a point, and no hole.
+    stays = np.setdiff1d(np.arange(len(at)), lands(points))
+    kept = (points, normals, fields, spacing, ranks)
+    return Rows(*jax.tree.map(lambda u: on_device(u[stays]), kept))
 
 
 def conserved(before: Discretization, old, after: Discretization, new) -> PyTree[Array]:
@@ -269,16 +287,22 @@ def conserved(before: Discretization, old, after: Discretization, new) -> PyTree
     return jax.tree.map(corrected, old, new)
 
 
-def _interpolated(cloud, neighbors, degree: int, at, arrays) -> PyTree[np.ndarray]:
+def _interpolated(surface: Discretization, degree: int, at, arrays) -> PyTree[np.ndarray]:
     """Points, normals and fields at some places above the surface, in one go.
 
     In NumPy where their number counts: nothing is compiled for it.
     """
     leaves, structure = jax.tree.flatten(arrays)
     together = np.concatenate([np.asarray(u).reshape(len(u), -1) for u in leaves], axis=1)
-    count, at = len(at), at.astype(cloud.points.dtype)
-    found = np.array(interpolated(cloud, neighbors, degree, on_device(at), on_device(together)))
-    parts = np.split(found, np.cumsum([u.size // len(u) for u in leaves])[:-1], axis=1)
+    cloud, count = surface.cloud, len(at)
+    places = on_device(at.astype(cloud.points.dtype))
+    found = interpolated(cloud, surface.neighbors, degree, places, on_device(together))
+    parts = np.split(np.array(found), np.cumsum([u.size // len(u) for u in leaves])[:-1], axis=1)
     parts = [v.reshape(count, *u.shape[1:]).astype(u.dtype) for u, v in zip(leaves, parts)]
     points, normals, fields = jax.tree.unflatten(structure, parts)
     return points, normals / np.linalg.norm(normals, axis=1, keepdims=True), fields
+
+
+def _put(rows: np.ndarray, values: np.ndarray, new: np.ndarray) -> np.ndarray:
+    values[rows] = new
+    return values

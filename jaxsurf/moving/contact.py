@@ -36,7 +36,8 @@ class Contact(eqx.Module):
 
     Sheets are of two surfaces or of one, and meet from outside, or through the inside of a part
     that has become thin. Those are found by their normals, which oppose each other; so do those
-    of a corner of less than a right angle, which "delete" rounds off before it folds. Only sheets
+    of a corner of less than a right angle, and of points that a front has left behind in a corner:
+    "delete" rounds it off before it folds. Only sheets
     of two surfaces that are kept apart, or stick, may have normals that point the same way.
 
     Args:
@@ -123,6 +124,29 @@ def facing(cloud: PointCloud, reach: float) -> Facing:
     near = gap <= reach * np.minimum(1, _WIDE * np.sqrt((1 - cosine) / 2))
     good = near & steep & (cosine < _OPPOSED) & (ups[0] * ups[1] > 0)
     return Facing(rows[np.stack([i, j], axis=1)[good]], gap[good], ups[0][good] < 0)
+
+
+def turned_over(cloud: PointCloud, neighbors: Neighbors) -> Facing:
+    """Pairs of points next to each other in a corner that folds.
+
+    Their normals oppose each other; or the way from one to the other is along both normals, where
+    one has been left behind.
+    """
+    x, n = np.asarray(cloud.points, float), np.asarray(cloud.normals, float)
+    near, on = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
+    ring = slice(1, 2 * cloud.dim + 1)
+    way = x[near] - x[:, None]
+    heights = [np.einsum("nkd,nd->nk", way, n), np.einsum("nkd,nkd->nk", way, n[near])]
+    steep = np.minimum(*np.abs(heights)) > _STEEP * np.linalg.norm(way, axis=2)
+    opposed = np.einsum("nkd,nd->nk", n[near], n) < _OPPOSED
+    folds = on & (opposed | steep & (heights[0] * heights[1] > 0))
+    row, slot = np.nonzero(folds[:, ring])
+    pairs = np.unique(np.sort(np.stack([row, near[row, slot + 1]], axis=1), axis=1), axis=0)
+    row = pairs[:, 0]
+    # Through the inside where the points around are below.
+    mean = np.einsum("nk,nkd->nd", on[row], n[near[row]])
+    rise = np.einsum("nk,nkd,nd->n", on[row], way[row], mean)
+    return Facing(pairs, np.linalg.norm(x[pairs[:, 1]] - x[row], axis=1), rise < 0)
 
 
 def chambers(

@@ -12,30 +12,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from ..arguments import is_array
 from ..discretization import Discretization, discretize
 from ..failures import is_concrete
 from ..functions import canonical
-from ..motion import stretch, unreached
-from ..neighbors import Neighbors
+from ..motion import unreached
 from ..renew import NeighborSearch
 from ..time.checkpoint import Checkpoint, digest, read_back, written
 from ..time.integrate import IntegrationError, integrate
 from ..time.run import planned
-from ..time.saving import AbstractCondition
 from .adaptation import Adaptation, changed, conserved
 from .contact import Contact, watched
 from .problem import Moving, fitted_normals, joined, parted
 from .surgery import rejoined
+from .wear import Worn, uneven
 
-# Points are added and merged where neighbourhoods have grown or shrunk by this factor, and a step
-# that has taken them past its square is taken again, in parts.
-_STRETCH = 1.15
-# Lists are found anew once points outside may come as near as this share of the farthest in them.
-_WORN = 0.75
 # Room to find neighbours in where points are added, in units of what they need: arrays for it that
 # are too short are made anew, and a program with them, which takes many times as long as to search.
 _ROOM = 2.0
@@ -207,12 +201,26 @@ class _Run:
 
     @property
     def saved(self) -> _Place:
-        with self.when():
-            surface = self.moving.surface_at(self.state[0])
-        # What was wrong with it would have been an error.
-        surface = eqx.tree_at(lambda s: s.found, surface, None, is_leaf=lambda x: x is None)
+        try:
+            surface = self.seen()
+            if self.contact is not None and self.contact.deletes:
+                _ = surface.areas  # a corner that is about to fold has none
+        except ValueError as error:  # lists or normals have ceased to serve: others may
+            with self.when():
+                try:
+                    self.renew()
+                except ValueError:
+                    raise error from None
+                if self.gone:
+                    return self.place
+                surface = self.seen()
         fields = self.moving.fields(self.t, self.state, self.options["args"])
         return _Place(surface, joined(self.state[0], fields))
+
+    def seen(self) -> Discretization:
+        surface = self.moving.surface_at(self.state[0])
+        # What was wrong with it would have been an error.
+        return eqx.tree_at(lambda s: s.found, surface, None, is_leaf=lambda x: x is None)
 
     def count(self, steps: int, refused: int, renewals: int) -> None:
         self.counts = self.counts + np.array([steps, refused, renewals])
@@ -224,8 +232,8 @@ class _Run:
             due = self.next_change()
             end = min(end, due, self.next_look())
             surface, neighbors = self.moving.surface, self.moving.surface.neighbors
-            start, uneven = surface.cloud.points, self.adapt is not None
-            event = dfx.Event(_Worn(start, neighbors, self.free, uneven))
+            start, adapts = surface.cloud.points, self.adapt is not None
+            event = dfx.Event(Worn(start, neighbors, self.free, adapts))
             solution, reached, new = self.stretch(end, event)
             stats = solution.stats
             steps, refused = (int(stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected"))
@@ -234,7 +242,7 @@ class _Run:
             if left and (
                 np.any(unreached(start, new[0], neighbors))
                 or self.may_cross(new[0])
-                or (uneven and np.any(_uneven(start, new[0], neighbors, _STRETCH**2)))
+                or (adapts and np.any(uneven(start, new[0], neighbors, times=2)))
             ):
                 # The last step went farther than the neighbours serve: half of the way first.
                 end = self.t + (reached - self.t) / 2
@@ -244,7 +252,7 @@ class _Run:
             self.t, self.state, end = reached, new, target
             self.tell(reached)
             ended = solution.result == dfx.RESULTS.event_occurred or float(reached) < float(target)
-            if ended or float(reached) >= float(due):
+            if ended or self.next_change() > due:
                 self.renew()
 
     def stretch(self, end, event: dfx.Event) -> tuple[dfx.Solution, Any, tuple]:
@@ -369,32 +377,3 @@ def _seen(tree):
 @eqx.filter_jit
 def _velocity(moving: Moving, t, state, args) -> Float[Array, "n d"]:
     return moving.rate(t, state, args)[0]
-
-
-class _Worn(AbstractCondition):
-    """True once lists do not serve well, from where the points were when they were found.
-
-    Args:
-        free: how far points may go before sheets may touch; None if that does not matter.
-        uneven: also where neighbourhoods have become so much larger or smaller that points are to
-            be added or merged.
-    """
-
-    points: Float[Array, "n d"]
-    neighbors: Neighbors
-    free: Float[Array, " n"] | None
-    uneven: bool = eqx.field(static=True)
-
-    def __call__(self, t, y, args, **_) -> Bool[Array, ""]:
-        worn = unreached(self.points, y[0], self.neighbors, _WORN)
-        if self.free is not None:
-            worn = worn | (jnp.sum((y[0] - self.points) ** 2, axis=1) > self.free**2)
-        if self.uneven:
-            worn = worn | _uneven(self.points, y[0], self.neighbors, _STRETCH)
-        return jnp.any(worn)
-
-
-def _uneven(before, after, neighbors: Neighbors, factor: float) -> Bool[Array, " n"]:
-    """Where neighbourhoods have grown or shrunk by more than a factor."""
-    growth = stretch(before, after, neighbors)
-    return (growth > factor) | (growth < 1 / factor)

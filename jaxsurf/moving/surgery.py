@@ -17,7 +17,7 @@ from ..discretization import Discretization
 from ..failures import raise_at
 from ..neighbors import Neighbors
 from ..shapes.thinning import DISK, poisson_disk
-from .contact import Facing, chambers, facing
+from .contact import Facing, chambers, facing, turned_over
 from .rows import Rows, exchanged
 
 # All within this of the middle between two points that face each other is cut out, in contact
@@ -59,7 +59,8 @@ def cut(
     spacing: Float[np.ndarray, " n"],
 ) -> Cut | None:
     """Where a surface touches itself; None where it does not."""
-    met = facing(cloud, distance)
+    both = facing(cloud, distance), turned_over(cloud, neighbors)
+    met = jax.tree.map(lambda *found: np.concatenate(found), *both)
     if not len(met.pairs):
         return None
     x, on, part = np.asarray(cloud.points, float), cloud.host_active, chambers(cloud, neighbors)

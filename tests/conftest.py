@@ -39,7 +39,7 @@ def _optimised(level: int) -> dict[str, str]:
 
 
 # Full collections of garbage take a third of the time in which large programs are traced.
-gc.set_threshold(700, 10, 1_000)
+gc.set_threshold(100_000, 20, 1_000)
 os.environ.update(_optimised(0))
 
 import jax

@@ -190,6 +190,21 @@ def test_points_slide_by_a_vector_each(slide):
         js.evolve(Turning(slide), SURFACE.cloud, t1=0.1, fields=Z, solver=dfx.Tsit5())
 
 
+def test_what_slides_stays_on_the_surface():
+    with pytest.raises(ValueError, match=r"sliding of Turning leaves the surface at point 0: 1 of"):
+        js.evolve(Turning(lambda s: s.cloud.normals), SURFACE.cloud, t1=0.1, fields=Z)
+
+
+@pytest.mark.parametrize(
+    "wrong", [lambda s: jnp.array([0.0, 0.0, 1.0]), lambda s: s.cloud.points[:, :1]]
+)
+def test_each_part_of_a_sum_is_a_vector_for_each_point(wrong):
+    grow = js.Motion(lambda t, surface, fields, args: surface.cloud.normals)
+    both = grow + 0.5 * js.Motion(lambda t, surface, fields, args: wrong(surface))
+    with pytest.raises(ValueError, match=r"velocity of Motion has shape .*\(300, 3\)"):
+        js.evolve(both, SURFACE.cloud, t1=0.1)
+
+
 RATE = 0.001
 
 

@@ -201,26 +201,34 @@ class _Run:
 
     @property
     def saved(self) -> _Place:
-        try:
+        surface = self.seen()
+        if float(self.t) > float(self.start) and (surface is None or self.folds(surface)):
+            # Lists or normals have ceased to serve: others may.
+            before = vars(self).copy()
+            try:
+                self.renew()
+            except ValueError:
+                vars(self).update(before)
+            if self.gone:
+                return self.place
             surface = self.seen()
-            if self.contact is not None and self.contact.deletes:
-                _ = surface.areas  # a corner that is about to fold has none
-        except ValueError as error:  # lists or normals have ceased to serve: others may
-            with self.when():
-                try:
-                    self.renew()
-                except ValueError:
-                    raise error from None
-                if self.gone:
-                    return self.place
-                surface = self.seen()
+        with self.when():
+            surface = surface or self.moving.surface_at(self.state[0])
         fields = self.moving.fields(self.t, self.state, self.options["args"])
         return _Place(surface, joined(self.state[0], fields))
 
-    def seen(self) -> Discretization:
-        surface = self.moving.surface_at(self.state[0])
-        # What was wrong with it would have been an error.
-        return eqx.tree_at(lambda s: s.found, surface, None, is_leaf=lambda x: x is None)
+    def seen(self) -> Discretization | None:
+        """The surface there, if there is one; what was wrong with it would have been an error."""
+        with contextlib.suppress(ValueError):
+            surface = self.moving.surface_at(self.state[0])
+            return eqx.tree_at(lambda s: s.found, surface, None, is_leaf=lambda x: x is None)
+        return None
+
+    def folds(self, surface: Discretization) -> bool:
+        """Whether a corner is about to: neighbours no longer close cells, and contact would cut."""
+        if self.contact is None or not self.contact.deletes:
+            return False
+        return not _has_areas(surface) and _has_areas(self.moving.surface)
 
     def count(self, steps: int, refused: int, renewals: int) -> None:
         self.counts = self.counts + np.array([steps, refused, renewals])
@@ -372,6 +380,13 @@ def _seen(tree):
     if not is_concrete(tree):
         raise ClosesOverTraced
     return tree
+
+
+def _has_areas(surface: Discretization) -> bool:
+    """Whether neighbours close all cells, as those in folds of scans do not."""
+    with contextlib.suppress(ValueError):
+        return surface.areas.size > 0
+    return False
 
 
 @eqx.filter_jit

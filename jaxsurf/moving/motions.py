@@ -7,12 +7,17 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from ..arguments import real, traced_call
+from ..arguments import as_float, real, traced_call
 from ..discretization import Discretization
-from ..failures import is_concrete
+from ..failures import is_concrete, raise_at
 from ..functions import numbers_as_arrays
+
+# Of the longest vector of a sliding, what its parts along normals may be: normals are not exact.
+_OFF = 0.1
 
 
 class AbstractMotion(eqx.Module):
@@ -52,11 +57,21 @@ class AbstractMotion(eqx.Module):
         return False
 
     def sliding(self, t, surface: Discretization, fields: PyTree[Array], args) -> Array:
-        """How they do, `(n, d)`, while fields stay where they are."""
+        """How they do, `(n, d)`, tangential, while fields stay where they are."""
         raise NotImplementedError
 
     def check(self, t, surface: Discretization, fields: PyTree[Array], args) -> None:
-        """Raise what is seen to be wrong from numbers at the start of a run; nothing by default."""
+        """Raise what is seen to be wrong from numbers at the start of a run; by default that
+        `sliding` is off the surface."""
+        if not self.slides:
+            return
+        slide = vectors(self, "sliding", t, surface, fields, args)
+        off = jnp.abs(jnp.sum(slide * surface.cloud.normals, axis=1))
+        text = (
+            f"sliding of {type(self).__name__} leaves the surface at point {{i}}: {{v:.3g}} of it "
+            "is along the normal, expected a vector along the surface; what moves that is velocity"
+        )
+        raise_at(np.asarray(off > _OFF * jnp.max(jnp.linalg.norm(slide, axis=1))), text, off)
 
     def __add__(self, other: AbstractMotion) -> AbstractMotion:
         return MotionSum(self._parts + other._parts) if _is_motion(other) else NotImplemented
@@ -123,7 +138,8 @@ class MotionSum(AbstractMotion):
         return _Pulls(known) if known else None
 
     def velocity(self, t, surface, fields, args):
-        each = [factor * m.velocity(t, surface, fields, args) for factor, m in self.parts]
+        given = (t, surface, fields, args)
+        each = [factor * vectors(motion, "velocity", *given) for factor, motion in self.parts]
         return sum(each[1:], each[0])
 
     @property
@@ -132,7 +148,8 @@ class MotionSum(AbstractMotion):
 
     def sliding(self, t, surface, fields, args):
         parts = [(factor, motion) for factor, motion in self.parts if motion.slides]
-        each = [factor * motion.sliding(t, surface, fields, args) for factor, motion in parts]
+        given = (t, surface, fields, args)
+        each = [factor * vectors(motion, "sliding", *given) for factor, motion in parts]
         return sum(each[1:], each[0])
 
     def check(self, t, surface, fields, args):
@@ -142,6 +159,13 @@ class MotionSum(AbstractMotion):
     def __repr__(self):
         number = lambda x: f"{float(x):g}" if is_concrete(x) else "traced"
         return " + ".join(f"{number(factor)} * {motion!r}" for factor, motion in self.parts)
+
+
+def vectors(motion: AbstractMotion, what: str, t, surface: Discretization, fields, args) -> Array:
+    """The "velocity" or "sliding" of a motion: a vector for each point, of the type of points."""
+    points = surface.cloud.points
+    found = getattr(motion, what)(t, surface, fields, args)
+    return as_float(found, f"{what} of {type(motion).__name__}", points.shape).astype(points.dtype)
 
 
 class _Pulls(eqx.Module):

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..arguments import as_float, switched_off
+from ..arguments import switched_off
 from ..cloud import PointCloud
 from ..discretization import Discretization
 from ..failures import is_concrete, marking, warn
@@ -23,7 +23,7 @@ from ..time.higher import WaveEquation
 from ..time.implicit import IMEX
 from ..time.problem import AbstractEvolution
 from .contact import Faced
-from .motions import AbstractMotion
+from .motions import AbstractMotion, vectors
 from .tolerances import RelativeToSurface
 
 
@@ -117,9 +117,7 @@ class Moving(AbstractEvolution):
             dilution = problem.dilution(fields, surface.divergence(velocity))
             changes += [problem.rate(t, fields, args), dilution]
         if self.motion.slides:
-            slide = self.motion.sliding(t, surface, fields, args)
-            name = f"sliding of {type(self.motion).__name__}"
-            slide = as_float(slide, name, points.shape).astype(points.dtype)
+            slide = vectors(self.motion, "sliding", t, surface, fields, args)
             passed = lambda u: jnp.einsum("nx,n...x->n...", slide, surface.gradient(u))
             changes, velocity = [*changes, jax.tree.map(passed, fields)], velocity + slide
         return self._free(joined(velocity, jax.tree.map(lambda *each: sum(each), *changes)))
@@ -161,9 +159,7 @@ class Moving(AbstractEvolution):
         # A step that is tried may take the surface to where it has none: it is refused, and a
         # shorter one is tried.
         with marking():
-            velocity = self.motion.velocity(t, surface, fields, args)
-        name = f"velocity of {type(self.motion).__name__}"
-        velocity = as_float(velocity, name, points.shape).astype(points.dtype)
+            velocity = vectors(self.motion, "velocity", t, surface, fields, args)
         if self.faced is None:
             return velocity
         return self.faced.kept_apart(points, surface.cloud.normals, surface.shape_tensor, velocity)

@@ -154,7 +154,8 @@ def weights_by(method: AbstractMethod, around: Neighborhood, target: AbstractTar
 
 
 # Positive weights have taken over where the share of the centre has fallen so far below what is
-# needed, and support times curvature risen so far above one.
+# needed, and support times curvature risen so far above one; or above half, as the share, so far
+# from nothing, falls to that: what a centre of the wrong sign makes grow nothing else holds.
 _SHORT, _BEYOND = 0.1, 0.25
 
 
@@ -173,7 +174,8 @@ def _calmed(method: AbstractMethod, around: Neighborhood, weights, support):
         # Without a jump where neighbours enter the support.
         s = around.squared / support**2
         tube = support * power_mean(_bend(around), jnp.where(around.mask, taper(s), 0))
-        part = short * ramp((tube - 1) / _BEYOND)
+        bends = 1 - ramp(1 - share / _SHORT) / 2
+        part = short * ramp((tube - bends) / _BEYOND)
         blend = weights + part * (_positive(around, s) / support**2 - weights)
         return jnp.where(part > 0, blend, weights)
 

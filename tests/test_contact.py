@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 import jaxsurf as js
 from jaxsurf.moving import follow
-from jaxsurf.moving.contact import chambers, facing, watched
+from jaxsurf.moving.contact import chambers, facing, turned_over, watched
 from jaxsurf.moving.surgery import HermiteSurface, rejoined
 
 METHOD = js.GFDM(degree=2)
@@ -63,6 +63,32 @@ def test_what_faces_what():
     np.testing.assert_array_equal(found.inside, both_small)
     assert both_small.any() and not both_small.all()
     np.testing.assert_allclose(found.gap, gap[*found.pairs.T])
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_corners_that_fold(inside):
+    """An angle of 60 degrees, and one of 90 in which a point was left behind; not one of 90."""
+
+    def bent(angle, *more):
+        s = np.arange(-10, 10) + 0.5
+        across, up = np.sin(np.radians(angle / 2)), np.cos(np.radians(angle / 2))
+        x = np.stack([s * across, np.abs(s) * up], axis=1)
+        n = np.stack([-np.sign(s) * up, across + 0 * s], axis=1)
+        x, n = np.concatenate([x, *more[:1]]), np.concatenate([n, *more[1:]])
+        cloud = js.PointCloud(x, -n if inside else n)
+        # As those that were found before it folded.
+        near = jnp.asarray(cKDTree(x).query(x, 9)[1], jnp.int32)
+        return turned_over(cloud, js.Neighbors(near, jnp.ones(near.shape, bool)))
+
+    folds = bent(60)
+    assert [9, 10] in folds.pairs.tolist() and np.all(np.abs(folds.pairs - 9.5) < 3)
+    assert np.all(folds.inside == inside)
+    sphere = js.sphere(80)
+    assert not len(bent(90).pairs)
+    assert not len(turned_over(sphere, js.find_neighbors(sphere, k=15)).pairs)
+    behind = bent(90, [[0.4, -0.5]], [[-np.sqrt(0.5), np.sqrt(0.5)]])
+    assert (behind.pairs[:, 1] == 20).all() and 10 in behind.pairs[:, 0]
+    assert np.all(behind.inside == inside)
 
 
 def with_a_waist(width, spacing=0.07):

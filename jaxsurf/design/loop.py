@@ -15,7 +15,7 @@ import numpy as np
 import optax
 from jaxtyping import PyTree
 
-from ..arguments import same_values
+from ..arguments import flag, same_values
 from ..time.checkpoint import Checkpoint, digest, read_back, written
 from .asked import ILL, is_only_far, refuse_start
 from .lagrangian import (
@@ -157,7 +157,8 @@ class Loop(NamedTuple):
                 break
             if file is not None and (stopped or int(run.step) % file.every == 0):
                 written(file.path, file.told, run)
-            if self.callback is not None and self.callback(self.found(run, shape, stopped)):
+            said = self.callback(self.found(run, shape, stopped)) if self.callback else None
+            if said is not None and flag(np.asarray(said)[()], "what callback returns"):
                 stopped = stopped or "ended by the callback"
         return self.found(run, shape, stopped), failed
 

@@ -74,7 +74,8 @@ def optimize_shape(
         renew: find neighbours anew, and points where there are other parts. If False they are
             those of `shape`, and known to the program, as `js.solve` asks for without a
             preconditioner.
-        callback: called with the `ShapeOptimization` so far after each step; True ends it.
+        callback: called with the `ShapeOptimization` so far after each step; True ends it, None
+            and False do not.
         checkpoint: where all is written after every so many steps; if the file is there, the same
             run, of more `steps` too, goes on from it and ends in the same bits; what a file of more
             steps than are asked for holds is returned as it is.
@@ -89,7 +90,7 @@ def optimize_shape(
         a ball is found within 1e-3 (`tests/test_optimize.py::test_single_precision`).
     Raises:
         TypeError: functions, a shape, an optimiser, a checkpoint that are none; parameters that are
-            no floating-point arrays.
+            no floating-point arrays; a callback that returns something else.
         ValueError: a first surface or value that is not good, in the words of `shape` or by name;
             numbers out of range; functions that return something else; traced arrays.
         OptimizationError: no good step is left, or constraints contradict each other; with the

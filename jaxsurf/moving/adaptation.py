@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from ..arguments import as_float, finite, flag, instance, real, switched_off, whole
 from ..compiling import on_device
 from ..discretization import Discretization, discretize
-from ..failures import needs_values, raise_at
+from ..failures import needs_values, raise_at, warn
 from ..interpolation import interpolated
 from .holes import border_gaps, close_pairs, fillings
 from .rows import Rows, compact, exchanged
@@ -270,8 +270,12 @@ def _placed(surface: Discretization, rows: Rows, found: _Sought, closest: float)
     spacing = np.concatenate([merged, found.spacing]).astype(rows.spacing.dtype)
     ranks = np.zeros(len(at), rank.dtype)
     ranks[: len(pairs)], ranks[edge] = rank[pairs[:, 0]], 1
-    # Where it still lands on another there is a point, and no hole.
-    stays = np.setdiff1d(np.arange(len(at)), lands(points))
+    if len(left := lands(points)):
+        warn(
+            f"{len(left)} holes are left, the first at {at[left[0]].round(4)}: local polynomials "
+            "lead from there to points that there are, so the surface is not resolved there"
+        )
+    stays = np.setdiff1d(np.arange(len(at)), left)
     kept = (points, normals, fields, spacing, ranks)
     return Rows(*jax.tree.map(lambda u: on_device(u[stays]), kept))
 

@@ -64,6 +64,7 @@ def boxed(level, bounds):
 
 CALLS = [
     ("optimize_shape", "a number for the objective", optimized(f=1.0), ("objective is a float", "function")),
+    ("optimize_shape", "a callback that returns a number", optimized(callback=lambda now: now.objective), ("callback returns", "True or False")),
     ("optimize_shape", "an objective with several values", optimized(f=lambda s: s.cloud.points[0]), ("objective", "(3,)", "one number")),
     ("optimize_shape", "an objective that is no number", optimized(f=lambda s: jnp.log(-reach(s))), ("objective is nan", "first theta")),
     ("optimize_shape", "a slope that is no number", optimized(f=lambda s: jnp.sqrt(0 * reach(s))), ("gradient", "not finite")),

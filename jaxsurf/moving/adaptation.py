@@ -42,7 +42,8 @@ class Adaptation(eqx.Module):
         hole: radius of the largest empty circle, in spacings.
         closest: distance at which two points become one, in spacings.
         every: the longest time between two looks; besides, there is one whenever a neighbourhood
-            has been stretched or has shrunk by 15 %. For spacings that change in time.
+            has been stretched or has shrunk by 15 %, or two points have neared by 30 %. For
+            spacings that change in time.
         conserve: add a constant to each field after each change, so that its integral stays.
         capacity: most points there may be, in arrays that have this length from the start, so that
             nothing compiles on the way. None: they grow by half, or more, when they are full.

@@ -260,7 +260,8 @@ def test_a_look_that_is_due_at_the_end_is_taken():
 
 
 # Turn, distance, radius of the other, spacing, degree, times of 0.4 to 1.6 where it is saved. All
-# but the first three ended as folds, in rounds without end, or had no areas where they were saved.
+# but the first three ended as folds, in rounds without end, or had no areas where they were saved,
+# some of them only as programs are optimised, or only as they are not.
 _JOINED = [
     (0.0, 2.6, 1.0, 0.11, 2, 2),
     (0.3, 2.6, 1.0, 0.11, 2, 2),

@@ -259,24 +259,26 @@ def test_a_look_that_is_due_at_the_end_is_taken():
     assert run.clouds[-1].n == 80
 
 
-# Turn, distance, radius of the other, spacing, degree, times of 0.4 to 1.6 where it is saved. All
-# but the first three ended as folds, in rounds without end, or had no areas where they were saved,
-# some of them only as programs are optimised, or only as they are not.
+_MANY, _MORE = np.linspace(0.4, 1.6, 23), np.linspace(0.4, 1.6, 61)
+# Turn, distance, radius of the other, spacing, degree, times where it is saved. All but the first,
+# the third and the fourth ended as folds, in rounds without end, or had no areas where they were
+# saved, some of them only as programs are optimised, or only as they are not.
 _JOINED = [
-    (0.0, 2.6, 1.0, 0.11, 2, 2),
-    (0.3, 2.6, 1.0, 0.11, 2, 2),
-    (0.392, 2.68, 1.04, 0.08, 2, 2),
-    (0.1, 2.6, 1.0, 0.11, 2, 61),
-    (0.503, 2.41, 0.8, 0.08, 2, 23),
-    (0.107, 2.8, 1.02, 0.14, 2, 23),
-    (0.380, 2.81, 1.01, 0.11, 4, 23),
-    (0.558, 2.65, 0.81, 0.11, 4, 23),
+    (0.0, 2.6, 1.0, 0.11, 2, [1.2]),
+    (0.1, 2.6, 1.0, 0.11, 2, [1.2]),
+    (0.3, 2.6, 1.0, 0.11, 2, [1.2]),
+    (0.392, 2.68, 1.04, 0.08, 2, [1.6]),
+    (0.1, 2.6, 1.0, 0.11, 2, _MORE),
+    (0.503, 2.41, 0.8, 0.08, 2, _MANY),
+    (0.107, 2.8, 1.02, 0.14, 2, _MANY),
+    (0.380, 2.81, 1.01, 0.11, 4, _MANY),
+    (0.558, 2.65, 0.81, 0.11, 4, _MANY),
 ]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("turn", "distance", "radius", "spacing", "degree", "times"), _JOINED)
-def test_a_corner_has_no_gap_and_no_fold(turn, distance, radius, spacing, degree, times):
+@pytest.mark.parametrize(("turn", "distance", "radius", "spacing", "degree", "ts"), _JOINED)
+def test_a_corner_has_no_gap_and_no_fold(turn, distance, radius, spacing, degree, ts):
     """Two circles that grow and join: what encloses both, but for what is rounded off.
 
     Corners become sharp again as the surface grows, and are rounded off again.
@@ -285,7 +287,7 @@ def test_a_corner_has_no_gap_and_no_fold(turn, distance, radius, spacing, degree
     for begin, r in ((turn, 1.0), (0.0, radius)):
         angle = begin + 2 * np.pi * np.arange(int(r * m * 1.05)) / int(r * m * 1.05)
         circles.append(np.stack([np.cos(angle), np.sin(angle)], axis=1))
-    (x, y), ts = circles, np.linspace(0.4, 1.6, times)
+    x, y = circles
     points = np.concatenate([x, radius * y + distance * x[0]])
     both = js.PointCloud(points, np.concatenate([x, y]))
     adapt, contact = js.Adaptation(spacing, every=0.1, capacity=500), js.Contact(3 * spacing)
@@ -295,7 +297,7 @@ def test_a_corner_has_no_gap_and_no_fold(turn, distance, radius, spacing, degree
     r, s, d = 1 + ts[-1] / 2, radius + ts[-1] / 2, distance
     half = np.arccos([(d**2 + a**2 - b**2) / (2 * d * a) for a, b in ((r, s), (s, r))])
     area = np.array([r, s]) ** 2 @ (np.pi - half + np.sin(half) * np.cos(half))
-    assert run.events["joined"].sum() >= 1
+    assert run.events["joined"][0] == 1
     # What is rounded off grows with the square of the distance of contact.
     assert abs(run.history["volume"][-1] - area) < 1.5 * spacing**2 * area
 

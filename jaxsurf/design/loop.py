@@ -157,7 +157,8 @@ class Loop(NamedTuple):
                 break
             if file is not None and (stopped or int(run.step) % file.every == 0):
                 written(file.path, file.told, run)
-            said = self.callback(self.found(run, shape, stopped)) if self.callback else None
+            call = self.callback
+            said = None if call is None else call(self.found(run, shape, stopped))
             if said is not None and flag(np.asarray(said)[()], "what callback returns"):
                 stopped = stopped or "ended by the callback"
         return self.found(run, shape, stopped), failed

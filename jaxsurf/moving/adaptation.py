@@ -262,23 +262,25 @@ def _placed(surface: Discretization, rows: Rows, found: _Sought, closest: float)
     # degree, and a point that lands on another would be merged with it, and come again.
     tree, near = cKDTree(x[cloud.host_active]), closest * found.spacing[len(found.feet) :]
     lands = lambda points: edge.stop + np.flatnonzero(tree.query(points[edge.stop :])[0] < near)
-    if len(swung := lands(made[0])):
+    left = swung = lands(made[0])
+    if len(swung):
         lower = _interpolated(surface, _LOWER, at[swung], arrays)
-        made = jax.tree.map(functools.partial(_put, swung), made, lower)
+        made = jax.tree.map(functools.partial(_replaced, swung), made, lower)
+        left = lands(made[0])
+    if len(left):
+        warn(
+            f"{len(left)} holes are left, the first at {at[left[0]].round(4)}: local polynomials "
+            "lead from there to points that there are, so the surface is not resolved there"
+        )
     points, normals, fields = made
     points[edge], normals[edge] = found.feet, found.normals
     merged = np.minimum(*np.asarray(rows.spacing)[pairs].T)
     spacing = np.concatenate([merged, found.spacing]).astype(rows.spacing.dtype)
     ranks = np.zeros(len(at), rank.dtype)
     ranks[: len(pairs)], ranks[edge] = rank[pairs[:, 0]], 1
-    if len(left := lands(points)):
-        warn(
-            f"{len(left)} holes are left, the first at {at[left[0]].round(4)}: local polynomials "
-            "lead from there to points that there are, so the surface is not resolved there"
-        )
-    stays = np.setdiff1d(np.arange(len(at)), left)
-    kept = (points, normals, fields, spacing, ranks)
-    return Rows(*jax.tree.map(lambda u: on_device(u[stays]), kept))
+    some = np.setdiff1d(np.arange(len(at)), left)
+    coming = (points, normals, fields, spacing, ranks)
+    return Rows(*jax.tree.map(lambda u: on_device(u[some]), coming))
 
 
 def conserved(before: Discretization, old, after: Discretization, new) -> PyTree[Array]:
@@ -308,6 +310,6 @@ def _interpolated(surface: Discretization, degree: int, at, arrays) -> PyTree[np
     return points, normals / np.linalg.norm(normals, axis=1, keepdims=True), fields
 
 
-def _put(rows: np.ndarray, values: np.ndarray, new: np.ndarray) -> np.ndarray:
+def _replaced(rows: np.ndarray, values: np.ndarray, new: np.ndarray) -> np.ndarray:
     values[rows] = new
     return values

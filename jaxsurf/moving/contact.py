@@ -133,20 +133,21 @@ def turned_over(cloud: PointCloud, neighbors: Neighbors) -> Facing:
     one has been left behind.
     """
     x, n = np.asarray(cloud.points, float), np.asarray(cloud.normals, float)
-    near, on = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
+    lists, used = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
     ring = slice(1, 2 * cloud.dim + 1)
+    near, on = lists[:, ring], used[:, ring]
     way = x[near] - x[:, None]
     heights = [np.einsum("nkd,nd->nk", way, n), np.einsum("nkd,nkd->nk", way, n[near])]
     steep = np.minimum(*np.abs(heights)) > _STEEP * np.linalg.norm(way, axis=2)
     opposed = np.einsum("nkd,nd->nk", n[near], n) < _OPPOSED
-    folds = on & (opposed | steep & (heights[0] * heights[1] > 0))
-    row, slot = np.nonzero(folds[:, ring])
-    pairs = np.unique(np.sort(np.stack([row, near[row, slot + 1]], axis=1), axis=1), axis=0)
-    row = pairs[:, 0]
+    row, slot = np.nonzero(on & (opposed | steep & (heights[0] * heights[1] > 0)))
+    pairs = np.unique(np.sort(np.stack([row, near[row, slot]], axis=1), axis=1), axis=0)
+    row, other = pairs.T
     # Through the inside where the points around are below.
-    mean = np.einsum("nk,nkd->nd", on[row], n[near[row]])
-    rise = np.einsum("nk,nkd,nd->n", on[row], way[row], mean)
-    return Facing(pairs, np.linalg.norm(x[pairs[:, 1]] - x[row], axis=1), rise < 0)
+    around, share = lists[row], used[row]
+    mean = np.einsum("mk,mkd->md", share, n[around])
+    rise = np.einsum("mk,mkd,md->m", share, x[around] - x[row, None], mean)
+    return Facing(pairs, np.linalg.norm(x[other] - x[row], axis=1), rise < 0)
 
 
 def chambers(

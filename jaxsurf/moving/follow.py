@@ -201,7 +201,7 @@ class _Run:
 
     @property
     def saved(self) -> _Place:
-        surface = self.seen()
+        surface = self.now()
         if float(self.t) > float(self.start) and (surface is None or self.folds(surface)):
             # Lists or normals have ceased to serve: others may.
             before = vars(self).copy()
@@ -211,13 +211,13 @@ class _Run:
                 vars(self).update(before)
             if self.gone:
                 return self.place
-            surface = self.seen()
+            surface = self.now()
         with self.when():
             surface = surface or self.moving.surface_at(self.state[0])
         fields = self.moving.fields(self.t, self.state, self.options["args"])
         return _Place(surface, joined(self.state[0], fields))
 
-    def seen(self) -> Discretization | None:
+    def now(self) -> Discretization | None:
         """The surface there, if there is one; what was wrong with it would have been an error."""
         with contextlib.suppress(ValueError):
             surface = self.moving.surface_at(self.state[0])

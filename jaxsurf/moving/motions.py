@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from ..arguments import as_float, real, traced_call
+from ..arguments import as_float, real, switched_off, traced_call
 from ..discretization import Discretization
 from ..failures import is_concrete, raise_at
 from ..functions import numbers_as_arrays
@@ -66,6 +66,7 @@ class AbstractMotion(eqx.Module):
         if not self.slides:
             return
         slide = vectors(self, "sliding", t, surface, fields, args)
+        slide = switched_off(surface.cloud.active, slide)
         off = jnp.abs(jnp.sum(slide * surface.cloud.normals, axis=1))
         text = (
             f"sliding of {type(self).__name__} leaves the surface at point {{i}}: {{v:.3g}} of it "

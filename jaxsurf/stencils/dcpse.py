@@ -82,7 +82,10 @@ class DCPSE(AbstractMethod):
         share = _width(self.order) if self.width is None else self.width
         width = radius * share
         count = _layers(self.order) if self.layers is None else self.layers
-        step = radius / (count + 0.5) if self.layer_spacing is None else self.layer_spacing
+        if self.layer_spacing is None:
+            step = 1 / (share * (count + 0.5))
+        else:
+            step = self.layer_spacing / width
 
         # Along the axes of the tangent frame, in which the lines of copies are steep. Any rotated
         # axes give the same weights: these have no derivative.
@@ -94,16 +97,17 @@ class DCPSE(AbstractMethod):
             jnp.stack([dot(a, axis[None]) for axis in frame])
             for a in (neighborhood.offsets, neighborhood.normals)
         )
-        along = step * normals
-        copies = jnp.stack([offsets + m * along for m in range(-count, count + 1)], 1)
+        never = jnp.any(width < 0)
+        offsets, along = stored(offsets / width, never), step * normals
+        x = [offsets + m * along for m in range(-count, count + 1)]
+        x = stored(jnp.stack(x, 1), never)
         # On the hollow side copies are nearer than their point, so the point itself has to fade
         # as it leaves the support.
         fade = jnp.where(neighborhood.mask, taper(neighborhood.squared / radius**2), 0)
         low, high = _degrees(target.order, self.order)
-        x = copies / width
-        w = fade * gaussian(jnp.sum(x**2, axis=0), 1.0, 1 / share)
+        squared = stored(jnp.sum(x**2, axis=0), never)
+        w = stored(fade * gaussian(squared, 1.0, 1 / share), never)
         b = jnp.asarray(target.moments(dim, low, high), w.dtype)
-        x, w = (stored(a, jnp.any(width < 0)) for a in (x, w))
         eta, condition, residual = line_solve(x, w, b, low, high)
         diagnostics = Diagnostics.of(neighborhood, condition, residual, radius, count)
         eta = eta / width**target.order

@@ -47,8 +47,9 @@ def _summed(*rows, axis, size):
 
 
 def _summed_at_once(*rows, axis, size):
-    zeros = tuple(jnp.zeros((), row.dtype) for row in rows)
-    return jax.lax.reduce(rows, zeros, lambda a, b: tuple(map(jnp.add, a, b)), (axis,))
+    zero = jnp.zeros((), rows[0].dtype)
+    both = lambda a, b: tuple(map(jax.lax.add, a, b))
+    return jax.lax.reduce(rows, (zero,) * len(rows), both, (axis,))
 
 
 def _repeated(*rows, axis, size):

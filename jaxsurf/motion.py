@@ -16,6 +16,7 @@ from .cloud import PointCloud
 from .compiling import sized_jit
 from .failures import raise_at
 from .frames import frames_of
+from .neighbors import first_ring
 
 # What a code says of a point.
 CODES = {
@@ -131,8 +132,8 @@ def folded(cloud, neighbors):
         return found | (used & (jnp.sum(normals[index] * normals, axis=1) < 0)), None
 
     # Of those farther away, other lists would leave out what has turned.
-    ring = 2 * points.shape[1] + 1
-    lists = (neighbors.indices[:, 1:ring].T, neighbors.mask[:, 1:ring].T)
+    ring = first_ring(neighbors, points.shape[1])
+    lists = (ring.indices.T, ring.mask.T)
     return jax.lax.scan(opposite, jnp.zeros(len(points), bool), lists)[0]
 
 

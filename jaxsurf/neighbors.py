@@ -127,6 +127,12 @@ class Rows(eqx.Module):
     radius: Float[Array, "*r"] | None = None
 
 
+def first_ring(neighbors: Neighbors, dim: int) -> Rows:
+    """Lists of the points next to each, without itself: four on a curve, six on a surface."""
+    ring = slice(1, 2 * dim + 1)
+    return Rows(neighbors.indices[:, ring], neighbors.mask[:, ring])
+
+
 def find_neighbors(
     cloud: PointCloud | Float[Array, "n d"],
     k: int | None = None,

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from ..arguments import instance, real
 from ..cloud import PointCloud
-from ..neighbors import Neighbors
+from ..neighbors import Neighbors, Rows, first_ring
 
 Kind = Literal["delete", "non-penetration", "merge"]
 KINDS = get_args(Kind)
@@ -134,8 +134,8 @@ def turned_over(cloud: PointCloud, neighbors: Neighbors) -> Facing:
     """
     x, n = np.asarray(cloud.points, float), np.asarray(cloud.normals, float)
     lists, used = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
-    ring = slice(1, 2 * cloud.dim + 1)
-    near, on = lists[:, ring], used[:, ring]
+    ring = first_ring(neighbors, cloud.dim)
+    near, on = np.asarray(ring.indices), np.asarray(ring.mask)
     way = x[near] - x[:, None]
     heights = [np.einsum("nkd,nd->nk", way, n), np.einsum("nkd,nkd->nk", way, n[near])]
     steep = np.minimum(*np.abs(heights)) > _STEEP * np.linalg.norm(way, axis=2)
@@ -150,15 +150,13 @@ def turned_over(cloud: PointCloud, neighbors: Neighbors) -> Facing:
     return Facing(pairs, np.linalg.norm(x[other] - x[row], axis=1), rise < 0)
 
 
-def chambers(
-    cloud: PointCloud, neighbors: Neighbors, slots: int | None = None
-) -> Int[np.ndarray, " n"]:
+def chambers(cloud: PointCloud, neighbors: Neighbors | Rows) -> Int[np.ndarray, " n"]:
     """Which connected part of the surface each point is on, from 0; -1 where it is off.
 
-    Connected by lists, or by their first slots: parts of fewer points than a list holds are
-    connected to others by what is farther.
+    Connected by lists: parts of fewer points than a list holds are connected to others by what is
+    farther, but not by their `first_ring`.
     """
-    row, slot = np.nonzero(np.asarray(neighbors.mask)[:, :slots])
+    row, slot = np.nonzero(np.asarray(neighbors.mask))
     found = np.asarray(neighbors.indices)[row, slot]
     graph = coo_array((np.ones(len(row), np.int8), (row, found)), shape=(cloud.n, cloud.n))
     label, on = connected_components(graph, directed=False)[1], cloud.host_active
@@ -269,7 +267,7 @@ def _others(contact: Contact, cloud: PointCloud, neighbors: Neighbors):
 
 def _spacings(cloud: PointCloud, neighbors: Neighbors) -> Float[np.ndarray, " n"]:
     """Mean distance to the points next to each; zero where it is off."""
-    x, ring = np.asarray(cloud.points, float), slice(1, 2 * cloud.dim + 1)
-    on = np.asarray(neighbors.mask)[:, ring]
-    away = np.linalg.norm(x[np.asarray(neighbors.indices)[:, ring]] - x[:, None], axis=2)
+    x, ring = np.asarray(cloud.points, float), first_ring(neighbors, cloud.dim)
+    on = np.asarray(ring.mask)
+    away = np.linalg.norm(x[np.asarray(ring.indices)] - x[:, None], axis=2)
     return np.sum(np.where(on, away, 0), axis=1) / np.maximum(on.sum(axis=1), 1)

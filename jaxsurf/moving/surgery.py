@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from ..cloud import PointCloud
 from ..discretization import Discretization
 from ..failures import raise_at
-from ..neighbors import Neighbors
+from ..neighbors import Neighbors, first_ring
 from ..shapes.thinning import DISK, poisson_disk
 from .contact import Facing, chambers, facing, turned_over
 from .rows import Rows, exchanged
@@ -234,8 +234,8 @@ def rejoined(
 
 def _crumbs(surface: Discretization) -> tuple[Int[np.ndarray, " m"], int]:
     """Rows of parts that have fewer points than a stencil asks for, and how many such parts."""
-    dim = surface.cloud.dim
-    part = chambers(surface.cloud, surface.neighbors, 2 * dim + 1)
+    cloud, dim = surface.cloud, surface.cloud.dim
+    part = chambers(cloud, first_ring(surface.neighbors, dim))
     small = np.bincount(part[part >= 0]) < surface.method.neighbor_count(dim)
     return np.flatnonzero((part >= 0) & small[part]), int(small.sum())
 

@@ -82,9 +82,9 @@ class DCPSE(AbstractMethod):
         share = _width(self.order) if self.width is None else self.width
         width = radius * share
         count = _layers(self.order) if self.layers is None else self.layers
-        if self.layer_spacing is None:
-            step = 1 / (share * (count + 0.5))
-        else:
+        # In units of the width, as all that follows.
+        step: Array | float = 1 / (share * (count + 0.5))
+        if self.layer_spacing is not None:
             step = self.layer_spacing / width
 
         # Along the axes of the tangent frame, in which the lines of copies are steep. Any rotated
@@ -99,8 +99,8 @@ class DCPSE(AbstractMethod):
         )
         never = jnp.any(width < 0)
         offsets, along = stored(offsets / width, never), step * normals
-        x = [offsets + m * along for m in range(-count, count + 1)]
-        x = stored(jnp.stack(x, 1), never)
+        x = jnp.stack([offsets + m * along for m in range(-count, count + 1)], 1)
+        x = stored(x, never)
         # On the hollow side copies are nearer than their point, so the point itself has to fade
         # as it leaves the support.
         fade = jnp.where(neighborhood.mask, taper(neighborhood.squared / radius**2), 0)

@@ -43,25 +43,27 @@ def _in_blocks_jvp(primals, tangents):
 
 @copying_jit
 def blocks_of(cloud, neighbors, rows, size: int):
-    """Positions and normals of the neighbours of some rows, mask and radius, in blocks."""
+    """Positions and normals of the neighbours of some rows, mask, radius and border, in blocks."""
     return _read(*_columns_and_lists(cloud, neighbors, rows, size))
 
 
 def _columns_and_lists(cloud, neighbors, rows, size: int):
-    """Coordinates of all points and of their normals; and lists, mask and radius in blocks."""
-    cloud, radius = cloud.seen, neighbors.radius
+    """Coordinates of all points and of their normals; and lists, mask, radius, border in blocks."""
+    cloud, radius, border = cloud.seen, neighbors.radius, cloud.boundary
     if radius is not None:
         radius = namespace(radius).broadcast_to(radius, (cloud.n,))[in_blocks(rows, size)]
+    if border is not None:
+        border = border[in_blocks(rows, size)]
     slots, mask = (in_blocks(a.T, size) for a in (neighbors.indices, neighbors.mask))
-    return ([*cloud.points.T], [*cloud.normals.T]), (slots, mask, radius)
+    return ([*cloud.points.T], [*cloud.normals.T]), (slots, mask, radius, border)
 
 
 def _read(columns, lists):
     """What is seen of a neighbourhood, see `Neighborhood.of`."""
-    slots, mask, radius = lists
+    slots, *others = lists
     # One coordinate at a time: one gather for all of them is slower.
     points, normals = ([take(column, slots) for column in vectors] for vectors in columns)
-    return points, normals, mask, radius
+    return points, normals, *others
 
 
 @copying_jit

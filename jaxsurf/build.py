@@ -318,11 +318,12 @@ def _check(stencil: Stencil, neighbors, method, target, dim) -> None:
     assert diagnostics is not None
     on = np.asarray(neighbors.mask)[:, 0]
     residual = np.asarray(diagnostics.residual)
+    most, need = residual_tolerance(residual.dtype), method.basis_size(dim, target)
     raise_at(
-        on & ~(residual < residual_tolerance(residual.dtype)),
-        "degenerate stencil at point {i}: relative moment residual {v:.1e} with {count} points "
-        f"within the support {{support:.3g}}, {method} needs at least "
-        f"{method.basis_size(dim, target)} in general position",
+        on & ~(residual < most),
+        f"degenerate stencil at point {{i}}: relative moment residual {{v:.1e}}, above {most:.0e}, "
+        f"with {{count}} points within the support {{support:.3g}}; {method} needs at least {need} "
+        "in general position: more of them, or a lower degree or order",
         residual,
         count=diagnostics.count,
         support=diagnostics.support,
@@ -342,7 +343,8 @@ def determined(weights, residual, degree: int):
     """The weights of local polynomials, refused where the neighbours do not determine these."""
     text = (
         f"the neighbours of point {{i}} do not determine a polynomial of degree {degree}: relative "
-        "moment residual {v:.1e}"
+        f"moment residual {{v:.1e}}, above {residual_tolerance(residual.dtype):.0e}; more of them "
+        "may, or a lower degree"
     )
     return refuse(weights, _undetermined(residual), text, residual)
 

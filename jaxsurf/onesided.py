@@ -81,8 +81,9 @@ def eliminate(
         >>> bool((closure(jnp.zeros(500)) == jnp.where(equator, 2.0, 0.0)).all())
         True
     """
+    chosen = neighbors is not None
     if isinstance(cloud, Discretization):
-        neighbors = cloud.neighbors if neighbors is None else neighbors
+        neighbors = neighbors if chosen else cloud.neighbors
         border = cloud.border if border is None else border
         method = cloud.method if method is None else method
         cloud = cloud.cloud
@@ -109,6 +110,9 @@ def eliminate(
             nu = _conormals(cloud, condition, rows, own, border)
             near = _free_neighbors(cloud, rows, free, neighbors, method)
             w, residual = _outward_derivative(cloud, near, rows, nu, method)
+            if not chosen and _are_poor(residual):
+                near = _free_neighbors(cloud, rows, free, None, method)
+                w, residual = _outward_derivative(cloud, near, rows, nu, method)
             pivot, slots, weights = a + b * w[0], np.asarray(near.indices).T[1:], -b * w[1:]
             if throw and is_concrete(w, a, b):
                 size = np.abs(a) + np.abs(b) * np.abs(w).sum(axis=0)
@@ -161,7 +165,12 @@ def without_flux(surface: Discretization) -> Closure | None:
     known = is_concrete(neighbors, rows)
     with at_once() if known else nullcontext():
         near, others, bound = _without_bound(neighbors, rows)
-    w, residual = _outward_derivative(cloud, near, rows, border.conormals(cloud), method)
+    nu = border.conormals(cloud)
+    w, residual = _outward_derivative(cloud, near, rows, nu, method)
+    if _are_poor(residual):
+        near = _free_neighbors(cloud, np.asarray(rows), ~np.asarray(bound), None, method)
+        others = near.indices.T[1:]
+        w, residual = _outward_derivative(cloud, near, rows, nu, method)
     if is_concrete(w):
         names, found = np.asarray(rows), np.asarray(w)
         _check_stencils(names, near, residual, method, cloud.dim)
@@ -351,13 +360,21 @@ def _compacted(indices, mask, k=None):
     return np.take_along_axis(indices, order, axis=1), np.take_along_axis(mask, order, axis=1)
 
 
+def _are_poor(residual) -> bool:
+    """Whether a surface's own lists do not do, as where those on a border lie on few lines."""
+    return is_concrete(residual) and not bool(
+        (np.asarray(residual) < residual_tolerance(residual.dtype)).all()
+    )
+
+
 def _check_stencils(rows, near, residual, method, dim) -> None:
     residual = np.asarray(residual)
+    most, need = residual_tolerance(residual.dtype), method.basis_size(dim, Gradient()) - 1
     raise_at(
-        ~(residual < residual_tolerance(residual.dtype)),
-        "degenerate one-sided stencil at point {i}: relative moment residual {v:.1e} with {count} "
-        f"free neighbours, {method} needs {method.basis_size(dim, Gradient()) - 1} in general "
-        "position",
+        ~(residual < most),
+        "degenerate one-sided stencil at point {i}: relative moment residual {v:.1e}, above "
+        f"{most:.0e}, with {{count}} free neighbours; {method} needs {need} in general position: "
+        "more of them, or a lower degree or order",
         residual,
         points=rows,
         count=np.asarray(near.mask).sum(axis=1) - 1,

@@ -853,3 +853,61 @@ def test_bad_ghosts():
         js.with_ghosts(cloud, js.neumann(cloud.boundary), depth=-1.0)
     with pytest.raises(ValueError, match="does not determine the image"):
         js.with_ghosts(cloud, js.robin(cloud.boundary, a=0.0, b=0.0))
+
+
+def half_cylinder(along, around, grade=0.0):
+    """Of radius 1 and length 2, with corners; graded along its axis."""
+    q = np.linspace(0, 1, along)
+    z = 2 * q - 1 - grade / np.pi * np.sin(2 * np.pi * q)
+    z, angle = (a.ravel() for a in np.meshgrid(z, np.linspace(0, np.pi, around), indexing="ij"))
+    normals = np.stack([np.cos(angle), np.sin(angle), 0 * z], axis=1)
+    border = (np.abs(z) > 1 - 1e-9) | (angle < 1e-9) | (angle > np.pi - 1e-9)
+    points = normals + z[:, None] * np.array([0, 0, 1.0])
+    return js.PointCloud(points, normals, boundary=border), z, angle
+
+
+def test_the_laplacian_on_a_border_that_bends_keeps_its_weights():
+    """Positive weights, of one side only, would be no Laplacian: off by 2 in place of 0.03."""
+    cloud, z, angle = half_cylinder(18, 28)
+    surface, border = js.discretize(cloud), np.asarray(cloud.boundary)
+    assert np.asarray(surface.laplacian.diagnostics.tube)[border].max() > 0.7
+    error = np.abs(surface.laplacian(np.sin(2 * z + angle)) / 5 + np.sin(2 * z + angle))
+    assert error[border].max() < 0.05
+    assert error[~border].max() < 2e-3
+
+
+def test_a_graded_border_is_closed_by_other_neighbours_where_its_own_do_not_do():
+    """Those that are nearest along few lines do not determine a derivative across them."""
+    cloud, z, _ = half_cylinder(10, 17, grade=0.6)
+    surface = js.discretize(cloud)
+    conditions = js.neumann(cloud.boundary)
+    by_cloud = js.eliminate(cloud, conditions)
+    with pytest.raises(ValueError, match=r"above 1e-08, with \d+ free .* or a lower degree"):
+        js.eliminate(cloud, conditions, neighbors=surface.neighbors)
+    even = jnp.asarray(np.cos(np.pi * z))
+    want = by_cloud(even)
+    for closure in (js.eliminate(surface, conditions), js.without_flux(surface)):
+        np.testing.assert_allclose(closure(even), want, atol=1e-9)
+
+
+def test_what_is_incompatible_beside_fluxes_is_an_error():
+    """What fluxes add to the right-hand side at a border excuses little of it inside."""
+    radius, angle = np.meshgrid(np.geomspace(0.3, 1, 24), np.linspace(0, np.pi, 62))
+    border = np.ones(radius.shape, bool)
+    border[1:-1, 1:-1] = False
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=-1)
+    points, border = jnp.asarray(points.reshape(-1, 3)), border.ravel()
+    up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), points.shape)
+    cloud = js.PointCloud(points, up, boundary=border)
+    x, y, _ = points.T
+    u, across = jnp.exp(x) * jnp.sin(1.3 * y), jnp.exp(x) * 1.3 * jnp.cos(1.3 * y)
+    f, slopes = (1 - 1.3**2) * u, jnp.stack([u, across, 0 * u], axis=1)
+    flux = jnp.sum(slopes[border] * js.border_conormals(cloud), axis=1)
+    surface = js.discretize(cloud)
+    closure = js.eliminate(surface, js.neumann(border, flux))
+    preconditioner = js.multigrid(surface.laplacian, closure=closure)
+    solve = lambda f: js.solve(surface.laplacian, f, closure=closure, preconditioner=preconditioner)
+    stats = solve(f).stats
+    assert abs(stats["incompatible"]) < 0.01 * stats["compatible_within"]
+    with pytest.raises(ValueError, match="right-hand side is incompatible"):
+        solve(f + 0.2)

@@ -187,6 +187,42 @@ def test_derivatives_are_zero_where_points_are_off(name):
     assert max(float(jnp.abs(want).max()) for want in plain) > 1e-3
 
 
+RETURNED = {
+    "solution": lambda s, u, c: js.solve(
+        1 - s.laplacian, u, mean_zero=False, preconditioner=js.jacobi(1 - s.laplacian), rtol=1e-11
+    ).value,
+    "nonlinear": lambda s, u, c: js.solve_nonlinear(
+        s.laplacian, lambda v, u: u - v - v**3, jnp.zeros(s.n), args=u,
+        preconditioner=js.jacobi(1 - s.laplacian), rtol=1e-11,
+    ).value,
+    "mode": lambda s, u, c: js.eigenmodes(s.laplacian, 4).functions[:, 1] ** 2,
+    "distances": lambda s, u, c: js.geodesic_distance(
+        s.cloud, c.names([3]), neighbors=s.neighbors, rtol=1e-11
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(RETURNED))
+def test_what_comes_back_from_there_in_reverse_has_no_part(name):
+    """NaN, where a result is multiplied by a field that has it there."""
+
+    def slopes(c: Case):
+        def value(points, u):
+            cloud = js.PointCloud(points, c.cloud.normals, active=c.cloud.active)
+            surface = js.Discretization(cloud, c.neighbors, METHOD)
+            return surface.integrate(c.u * RETURNED[name](surface, u, c))
+
+        return jax.grad(value, (0, 1))(c.cloud.points, c.u)
+
+    plain, spread = (slopes(case) for case in CLOSED)
+    for want, have in zip(plain, spread):
+        assert not have[~ON].any()
+        size = float(jnp.abs(want).max())
+        np.testing.assert_allclose(have[ON], want, rtol=0, atol=1e-7 * size)
+    assert plain[0].any()
+
+
 # --- compilation ----------------------------------------------------------------------------------
 
 

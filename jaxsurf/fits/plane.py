@@ -25,14 +25,15 @@ class Neighborhood(eqx.Module):
     normals: Float[Array, "k d *p"]
     mask: Bool[Array, "k *p"]
     radius: Float[Array, "*p"] | None
+    border: Bool[Array, "*p"] | None = None
 
     @classmethod
-    def of(cls, points, normals, mask, radius) -> Neighborhood:
+    def of(cls, points, normals, mask, radius, border) -> Neighborhood:
         """From the coordinates of the neighbours and of their normals, axis by axis."""
         # The point itself stands in slot 0. Stored, as the derivative of a whole stencil would be
         # found again for each coordinate. (No component of a unit normal is 2.)
         offsets = stored(jnp.stack([x - x[0] for x in points], axis=1), normals[0][0, 0] > 2)
-        return cls(offsets, jnp.stack(normals, axis=1), mask, radius)
+        return cls(offsets, jnp.stack(normals, axis=1), mask, radius, border)
 
     def support(self, dim: int, given: float | None) -> Float[Array, "*p"]:
         """Support radius of a method: the given one, that of the search, or a length filled."""

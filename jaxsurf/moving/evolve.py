@@ -179,7 +179,8 @@ def evolve(
         1e-5 (`tests/test_moving.py`).
     Differentiable: reverse (forward with `adjoint=diffrax.ForwardMode()`), under `jit`, with the
         neighbours that there were at t0, which must then serve until t1. For longer, in parts: from
-        `surface.moved(points, normals, search=search)`, with neighbours found anew. What the host
+        `surface.moved(points, normals, search=search)`, with neighbours found anew. How steps were
+        chosen is not differentiated: give `dt0` where that matters. What the host
         decides, by `adapt` and `contact`, has no derivative; across points that were added it is
         that of a surface whose new points are carried by those around them,
         `surface.interpolate` (`tests/test_moving_gradients.py`). It is not defined across a cut.
@@ -362,9 +363,11 @@ def _kept(moving: Moving, state, t, times, options) -> Evolution:
             found = integrate(moving, state, t0=t, t1=target, **options)
             t, state = target, jax.tree.map(lambda y: y[-1], found.ys)
         code = moving.surface_at(parted(state)[0]).code
-        text = "the surface does not keep the neighbours it had at t0: " + "; ".join(
-            f"{number}: {text}" for number, text in CODES.items()
-        )
+        text = (
+            "the surface does not keep the neighbours it had at t0, which derivatives and compiled "
+            "runs ask for: make it shorter, or go on in parts from `surface.moved(points, normals, "
+            "search=search)`; outside jit and grad the run finds them anew. What it may be: "
+        ) + "; ".join(f"{number}: {text}" for number, text in CODES.items())
         # Whatever is looked at of it, fields alone or points.
         kept = functools.partial(refuse, bad=jnp.any(code > 0), message=text)
         state = jax.tree.map(kept, state)

@@ -115,7 +115,7 @@ def eigenmodes(
     values, functions, *others = _modes(system, k, degenerate, k)
     if closure is not None:
         functions = closure.homogeneous(functions)
-    return Modes(values, functions, *others)
+    return Modes(values, switched_off(operator.active, functions), *others)
 
 
 def lowest_space(operator: AbstractOperator, k: int, degenerate: float) -> Float[Array, "n K"]:

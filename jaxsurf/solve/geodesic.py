@@ -137,6 +137,8 @@ def geodesic_distance(
     place = cloud.points, cloud.normals
     where = place, neighbors, plain, path
     distance, cold, unsolved = _distances(*where, known, inverse, scale, rtol)
+    if cloud.active is not None:  # whatever comes back from there in reverse
+        distance = jnp.where(cloud.active, distance, jax.lax.stop_gradient(distance))
     distance = refuse(distance, cold, _COLD, error=RuntimeError)
     text = f"distances have not been found to a relative tolerance of {rtol:.1g} (`rtol`)"
     return refuse(distance, unsolved, text, error=RuntimeError)

@@ -244,7 +244,7 @@ def _solve(problem, u0, preconditioner, solver, limits, concrete, throw):
         tight = BiCGStab(jnp.minimum(rtol, finest), 0.0, 1000) if solver is None else solver
         last = problem.correction(v, problem.residual(v), preconditioner, tight).value
         v = v + last - jax.lax.stop_gradient(last)
-    u = problem.field(v)
+    u = switched_off(problem.operator.active, problem.field(v))  # in reverse too
     if throw:
         text = (
             "js.solve_nonlinear did not reach its tolerance within max_steps; with throw=False, "

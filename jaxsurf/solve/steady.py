@@ -25,6 +25,8 @@ from .system import System, check_system, tolerance
 _UNRESOLVED = 0.25
 # and this share of its mean modulus: what is compatible cancels.
 _CANCELLED = 0.1
+# Of what fluxes through borders add it may be so many spacings, in units of the surface's size.
+_SPACINGS = 2
 # Round-off may leave a residual of this share of the right-hand side.
 _EXCUSED = 0.1
 
@@ -55,7 +57,8 @@ def solve(
     `project` asks for the problem without it. With D the half row sums of $|A|$, about $4 / h^2$
     on a surface, the mean of $|D^{-1} A f|$ is how much of f is not resolved to second order;
     a quarter of that is allowed (even on random points compatible ones have no more than 0.04 of
-    it), but never more than a tenth of the mean of |f|.
+    it), but never more than a tenth of the mean of |f|. What fluxes through borders add to f there
+    is resolved nowhere: $2 / \sqrt n$ of its mean modulus is allowed.
 
     Args:
         operator: A, a scalar stencil such as `js.laplace_beltrami(...)`, shifted and scaled at
@@ -152,13 +155,16 @@ def _solve_one(rhs, offset, operator, closure, preconditioner, solver, limits, m
     u = v if closure is None else closure.homogeneous(v) + offset
     if mean_zero:
         u = u - jnp.sum(u) / count_on(operator.active, operator.n)
-        u = switched_off(operator.active, u)
+    # Whatever comes back from there in reverse.
+    u = switched_off(operator.active, u)
     # Judged at size one, as squares of 1e-300 are zero; and whatever the solver says, by residuals.
-    fixed, b, v = constant((system, known, v))
+    fixed, f, b, v = constant(
+        (system, rhs if closure is None else system.restriction(rhs), known, v)
+    )
     scale = scale_of(b)
-    b, v = b / scale, v / scale
+    f, b, v = f / scale, b / scale, v / scale
     signs = 1.0 - 2.0 * (jnp.arange(operator.n) % 2).astype(v.dtype)
-    products = fixed.reduced(jnp.stack([v, signs * v, b], axis=1))
+    products = fixed.reduced(jnp.stack([v, signs * v, f], axis=1))
     incompatible = fixed.shift(v)
     left = b - fixed.constant(incompatible, b.dtype) - products[:, 0]
     residual, size = jnp.linalg.norm(left), jnp.linalg.norm(b)
@@ -172,9 +178,10 @@ def _solve_one(rhs, offset, operator, closure, preconditioner, solver, limits, m
     result = lx.RESULTS.where(failed, found.result, lx.RESULTS.stagnation)
     result = lx.RESULTS.where(reached, lx.RESULTS.successful, result)
     unresolved = fixed.mean(jnp.abs(products[:, 2] * fixed.spread()))
-    allowed = jnp.minimum(_UNRESOLVED * unresolved, _CANCELLED * fixed.mean(jnp.abs(b)))
-    count = jnp.asarray(count_on(operator.active, operator.n), target.dtype)
-    allowed = allowed + target / jnp.sqrt(count)
+    allowed = jnp.minimum(_UNRESOLVED * unresolved, _CANCELLED * fixed.mean(jnp.abs(f)))
+    root = jnp.sqrt(jnp.asarray(count_on(operator.active, operator.n), target.dtype))
+    flux = fixed.mean(jnp.abs(b - f))
+    allowed = allowed + (_SPACINGS * flux + target) / root
     torn = reached & ~project & mean_zero & (jnp.abs(incompatible) > allowed)
     result = lx.RESULTS.where(torn, lx.RESULTS.singular, result)
     result = lx.RESULTS.where(jnp.all(jnp.isfinite(known)), result, lx.RESULTS.nonfinite_input)

@@ -155,7 +155,8 @@ def weights_by(method: AbstractMethod, around: Neighborhood, target: AbstractTar
 
 # Positive weights have taken over where the share of the centre has fallen so far below what is
 # needed, and support times curvature risen so far above one; or above half, as the share, so far
-# from nothing, falls to that: what a centre of the wrong sign makes grow nothing else holds.
+# from nothing, falls to that: what a centre of the wrong sign makes grow nothing else holds. Not on
+# a border: of one side only positive weights are no Laplacian, and no centre is dominant there.
 _SHORT, _BEYOND = 0.1, 0.25
 
 
@@ -174,7 +175,10 @@ def _calmed(method: AbstractMethod, around: Neighborhood, weights, support):
         # Without a jump where neighbours enter the support.
         s = around.squared / support**2
         tube = support * power_mean(_bend(around), jnp.where(around.mask, taper(s), 0))
-        bends = 1 - ramp(1 - share / _SHORT) / 2
+        early = ramp(1 - share / _SHORT) / 2
+        if around.border is not None:
+            early = jnp.where(around.border, 0, early)
+        bends = 1 - early
         part = short * ramp((tube - bends) / _BEYOND)
         blend = weights + part * (_positive(around, s) / support**2 - weights)
         return jnp.where(part > 0, blend, weights)

@@ -6,6 +6,7 @@ import functools
 import hashlib
 import os
 import re
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from types import CodeType
@@ -267,11 +268,12 @@ def read_back(
     """
     expected, structure = jax.tree.flatten(like)
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             found, seal = str(archive["key"]), str(archive["seal"])
             leaves = [archive[name] for name in sorted(archive.files) if name.startswith("leaf_")]
     except Exception as error:  # a damaged archive raises anything
-        raise ValueError(f"{path} does not hold a checkpoint, or is damaged: {error}") from error
+        why = error if zipfile.is_zipfile(path) else "it is no archive"
+        raise ValueError(f"{path} does not hold a checkpoint, or is damaged: {why}") from error
     if seal != digest((found, leaves)):
         raise ValueError(f"{path} is damaged: its content does not have the digest {seal}")
     size = lambda leaf: np.shape(leaf) if same_sizes else np.ndim(leaf)

@@ -46,16 +46,22 @@ def tangent_frames(normals: Float[Array, "*n d"]) -> Float[Array, "*n d d"]:
 def frames_of(normals: Float[AnyArray, "*n d"]) -> Float[AnyArray, "*n d d"]:
     """`tangent_frames` of normals that are not looked at, such as those of switched-off rows."""
     xp = namespace(normals)
-    if normals.shape[-1] == 2:
-        x, y = normals[..., 0], normals[..., 1]
-        return xp.stack([xp.stack([y, -x], axis=-1), normals], axis=-2)
-    x, y, z = normals[..., 0], normals[..., 1], normals[..., 2]
-    side = xp.where(z >= 0, 1, -1).astype(normals.dtype)
+    return xp.moveaxis(axes_of(xp.moveaxis(normals, -1, 0)), (0, 1), (-2, -1))
+
+
+def axes_of(normals: Float[AnyArray, "d *n"]) -> Float[AnyArray, "d d *n"]:
+    """The same for what has its points along the last axis, as the axes of the frames then."""
+    stack = namespace(normals).stack
+    if len(normals) == 2:
+        x, y = normals
+        return stack([stack([y, -x]), normals])
+    x, y, z = normals
+    side = namespace(normals).where(z >= 0, 1, -1).astype(normals.dtype)
     bend = -1 / (z + side)
     shear = x * y * bend
-    first = xp.stack([1 + side * x * x * bend, side * shear, -side * x], axis=-1)
-    second = xp.stack([shear, side + y * y * bend, -y], axis=-1)
-    return xp.stack([first, second, normals], axis=-2)
+    first = stack([1 + side * x * x * bend, side * shear, -side * x])
+    second = stack([shear, side + y * y * bend, -y])
+    return stack([first, second, normals])
 
 
 _compiled = jax.jit(frames_of)

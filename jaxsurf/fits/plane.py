@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..compiling import AnyArray, namespace, stored
-from ..frames import frames_of
+from ..frames import axes_of
 from ..kept import Kept, once
 from .kernels import gaussian, support
 from .moments import polynomial_fit
@@ -92,7 +92,7 @@ class TangentPlane(eqx.Module):
     def at(cls, normal, offsets, weights, width, radius) -> TangentPlane:
         """With weights of its own, perpendicular to a normal `(d, *p)`; also in NumPy."""
         xp = namespace(normal)
-        frame = xp.moveaxis(frames_of(normal.T), (-2, -1), (0, 1))
+        frame = axes_of(normal)
         along = [dot(offsets, axis[None]) / width for axis in frame]
         return cls(frame[:-1], xp.stack(along[:-1]), along[-1], weights, width, radius)
 

@@ -17,7 +17,7 @@ from ..fits.lines import line_solve
 from ..fits.moments import moment_solve
 from ..fits.monomials import polynomial_count
 from ..fits.plane import dot
-from ..frames import frames_of
+from ..frames import axes_of
 from .method import AbstractMethod, Diagnostics, Neighborhood, check_positive, with_center
 from .targets import AbstractTarget, Laplacian
 
@@ -92,7 +92,7 @@ class DCPSE(AbstractMethod):
         normal = jax.lax.stop_gradient(neighborhood.normals[0])
         length = jnp.sqrt(jnp.sum(normal**2, axis=0))
         normal = normal / jnp.where(length > 0, length, 1)
-        frame = jnp.moveaxis(frames_of(normal.T), (-2, -1), (0, 1))
+        frame = axes_of(normal)
         offsets, normals = (
             jnp.stack([dot(a, axis[None]) for axis in frame])
             for a in (neighborhood.offsets, neighborhood.normals)

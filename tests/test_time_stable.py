@@ -109,6 +109,21 @@ def test_steps_to_given_times_are_looked_at():
     js.integrate(problem, NOISE, t1=0.5, controller=fine, solver=dfx.Tsit5())
 
 
+def test_what_is_stiff_between_the_times_looked_at_is_found_as_it_grows():
+    """A damping that lasts for two steps made 6e5 of a field of size one; growth is none of it."""
+    pulse = lambda t, u, args: jnp.where((t > 0.53) & (t < 0.55), -3e3, 0.0) * u
+    run = lambda reaction, **given: js.integrate(
+        js.AdvectionDiffusionReaction(RING, reaction=reaction), NOISE, t1=0.6, **given
+    )
+    given = dict(solver=js.IMEX(order=2), dt0=0.01)
+    with pytest.raises(ValueError, match=r"dt0 = 0.01 is unstable at t = 0.5[345]"):
+        run(pulse, **given)
+    assert float(jnp.abs(run(pulse, **given, throw=False).ys[-1]).max()) > 1e4
+    assert float(jnp.abs(run(pulse).ys[-1]).max()) < 1e-3
+    grown = run(lambda t, u, args: (15 + jnp.sin(t)) * u, **given)
+    assert float(jnp.abs(grown.ys[-1]).max()) > 1e3
+
+
 def test_backwards_in_time_the_rate_has_the_other_sign():
     growth = js.AdvectionDiffusionReaction(
         gradient=GRADIENT, velocity=0 * TURN, reaction=lambda t, u, args: 500 * u

@@ -110,10 +110,11 @@ def integrate(
             another precision than its rate; a derivative in forward mode without `ForwardMode`.
         ValueError: a state that is not finite, or for which the right-hand side is not; steps of
             given length that are explicit, in part or whole, beyond the limit of stability (with
-            step, limit and spectral radius; of a rate that depends on time at six times); diffusion
-            backwards in time; a border about which nothing is said; tolerances out of range; times
-            or steps that are lost in the precision of the state; a linear part of a problem
-            of one's own that is not linear; a checkpoint that is of another run or damaged.
+            step, limit and spectral radius; of a rate that depends on time at six times, and at 128
+            where the state has grown a hundredfold after all); diffusion backwards in time; a
+            border about which nothing is said; tolerances out of range; times or steps that are
+            lost in the precision of the state; a linear part of a problem of one's own that is not
+            linear; a checkpoint that is of another run or damaged.
         IntegrationError: the end was not reached: the solution diverges (or grows a hundredfold
             where the equation lets none grow), the tolerance cannot be met, a linear system does
             not converge. Holds the last good state. (Under
@@ -193,6 +194,8 @@ def _finished(plan: Plan, run: Run, throw: bool) -> dfx.Solution:
         ended = lambda y: refuse(y, ~good, "the end was not reached")
         return eqx.tree_at(lambda s: s.ys, solution, jax.tree.map(ended, solution.ys))
     if any(bool(solution.result == r) for r in results):
+        if throw and (hidden := run.hidden(jax.tree.map(lambda leaf: leaf[-1], last))):
+            raise ValueError(_unstable(plan.name, run, hidden))
         return solution
     if verdict is not None and not bool(verdict.stable):
         if throw:

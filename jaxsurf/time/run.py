@@ -110,8 +110,8 @@ class Run(eqx.Module):
         unstable."""
         return None if self.step is None else amplification_of(self.solver)
 
-    def judged(self) -> Verdict | None:
-        """Whether they are; None if they cannot be."""
+    def judged(self, closely: bool = False) -> Verdict | None:
+        """Whether they are; None if they cannot be. Closely: at many times."""
         if self.amplification is None:
             return None
         terms = self.terms
@@ -121,7 +121,24 @@ class Run(eqx.Module):
         parts = terms.terms if isinstance(terms, dfx.MultiTerm) else (terms,)
         rates = tuple(part.vf for part in parts)
         now = (self.t0, self.u0, self.args, self.step, self.t1 - self.t0)
-        return check_steps(self.amplification, rates, *now, changes)
+        return check_steps(self.amplification, rates, *now, changes, closely)
+
+    def hidden(self, last: PyTree[Array]) -> Verdict | None:
+        """What made a state grow that nothing bounds, if it was steps; on the host.
+
+        They are looked at at few times before a run, where a rate depends on it.
+        """
+        if self.amplification is None or bool(jnp.isfinite(self.limit)):
+            return None
+        if root_mean_square(last) <= _GROWN * root_mean_square(self.u0):
+            return None
+        verdict = _judged_closely(self)
+        return None if verdict is None or bool(verdict.stable) else verdict
+
+
+@eqx.filter_jit
+def _judged_closely(run: Run) -> Verdict | None:
+    return run.judged(closely=True)
 
 
 class Plan(NamedTuple):

@@ -28,6 +28,8 @@ from .states import length, small
 _STEPS, _AMPLIFIED = 24, 2.0
 # Where a rate that depends on time is looked at: of no period in common.
 _PLACES = (0.0, 0.14, 0.33, 0.59, 0.83, 1.0)
+# And how many where a state has grown.
+_MANY = 128
 
 
 class Verdict(eqx.Module):
@@ -70,6 +72,7 @@ def check_steps(
     dt,
     span,
     changes: bool,
+    closely: bool = False,
 ) -> Verdict:
     """Compare what steps of length dt over a span of time do with what they should.
 
@@ -79,6 +82,7 @@ def check_steps(
         t0, u, args: where they are linearised.
         dt, span: in time, of either sign.
         changes: whether a rate depends on time.
+        closely: look at more times then.
     """
     step, rates, t0, u, args, dt, span = constant((step, rates, t0, u, args, dt, span))
     dt, length = jnp.abs(dt), jnp.abs(span)
@@ -105,7 +109,8 @@ def check_steps(
 
     none = jnp.zeros((_rank(u, len(rates)),) * 2, t0.dtype)
     fine = Verdict(jnp.asarray(True), t0, (none,) * len(rates), jnp.full_like(t0, -jnp.inf))
-    return jax.lax.scan(worse, fine, t0 + span * jnp.asarray(_PLACES, t0.dtype))[0]
+    places = np.linspace(0, 1, _MANY) if closely else _PLACES
+    return jax.lax.scan(worse, fine, t0 + span * jnp.asarray(places, t0.dtype))[0]
 
 
 def _rank(u: PyTree[Array], count: int) -> int:

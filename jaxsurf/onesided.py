@@ -19,7 +19,7 @@ from .cloud import PointCloud
 from .compiling import at_once, copying_jit, namespace, on_device, sized_jit
 from .conditions import Condition, checked_conditions
 from .discretization import Discretization
-from .failures import is_concrete, needs_values, raise_at
+from .failures import is_concrete, needs_values, raise_at, refuse
 from .fits.kernels import gaussian
 from .neighbors import Neighbors, Rows, nearest_of
 from .stencils.method import AbstractMethod, power_mean, ramp
@@ -113,10 +113,11 @@ def eliminate(
             if not chosen and _are_poor(residual):
                 near = _free_neighbors(cloud, rows, free, None, method)
                 w, residual = _outward_derivative(cloud, near, rows, nu, method)
+            if throw:
+                w = _checked(w, rows, near, residual, method, cloud.dim)
             pivot, slots, weights = a + b * w[0], np.asarray(near.indices).T[1:], -b * w[1:]
             if throw and is_concrete(w, a, b):
                 size = np.abs(a) + np.abs(b) * np.abs(w).sum(axis=0)
-                _check_stencils(rows, near, residual, method, cloud.dim)
                 check_pivots(pivot, size, rows, "value at point {i}: a + b w_i")
         parts.append((rows, slots, weights / pivot))
         place, pick = on_device(np.arange(start, start + m)), on_device(np.flatnonzero(own))
@@ -171,9 +172,9 @@ def without_flux(surface: Discretization) -> Closure | None:
         near = _free_neighbors(cloud, np.asarray(rows), ~np.asarray(bound), None, method)
         others = near.indices.T[1:]
         w, residual = _outward_derivative(cloud, near, rows, nu, method)
+    w = _checked(w, rows, near, residual, method, cloud.dim)
     if is_concrete(w):
         names, found = np.asarray(rows), np.asarray(w)
-        _check_stencils(names, near, residual, method, cloud.dim)
         size = np.abs(found).sum(axis=0)
         check_pivots(found[0], size, names, "value at point {i}: the weight w_i of its derivative")
     return Closure(cloud.n, rows, others, _shares(w), (), bound)
@@ -367,15 +368,17 @@ def _are_poor(residual) -> bool:
     )
 
 
-def _check_stencils(rows, near, residual, method, dim) -> None:
-    residual = np.asarray(residual)
+def _checked(w, rows, near, residual, method, dim) -> Float[Array, "k m"]:
+    """Weights that meet their conditions; what is traced ends in an error when it runs."""
     most, need = residual_tolerance(residual.dtype), method.basis_size(dim, Gradient()) - 1
-    raise_at(
+    residual, mask = (np.asarray(a) if is_concrete(a) else a for a in (residual, near.mask))
+    return refuse(
+        w,
         ~(residual < most),
         "degenerate one-sided stencil at point {i}: relative moment residual {v:.1e}, above "
         f"{most:.0e}, with {{count}} free neighbours; {method} needs {need} in general position: "
         "more of them, or a lower degree or order",
         residual,
         points=rows,
-        count=np.asarray(near.mask).sum(axis=1) - 1,
+        count=mask.sum(axis=1) - 1,
     )

@@ -888,6 +888,10 @@ def test_a_graded_border_is_closed_by_other_neighbours_where_its_own_do_not_do()
     want = by_cloud(even)
     for closure in (js.eliminate(surface, conditions), js.without_flux(surface)):
         np.testing.assert_allclose(closure(even), want, atol=1e-9)
+    # Compiled code has the lists of the surface alone.
+    closed = jax.jit(lambda x: js.without_flux(surface.moved(x)).weights)
+    with pytest.raises(Exception, match="degenerate one-sided stencil"):
+        closed(cloud.points)
 
 
 def test_what_is_incompatible_beside_fluxes_is_an_error():

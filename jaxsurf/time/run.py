@@ -110,27 +110,32 @@ class Run(eqx.Module):
         unstable."""
         return None if self.step is None else amplification_of(self.solver)
 
+    @property
+    def changes(self) -> bool:
+        """Whether a rate depends on time."""
+        return any(part.reads_first for part in _programs(self.terms))
+
     def judged(self, closely: bool = False) -> Verdict | None:
         """Whether they are; None if they cannot be. Closely: at many times."""
         if self.amplification is None:
             return None
         terms = self.terms
-        changes = any(part.reads_first for part in _programs(terms))
         if has_phases(terms):
             terms = frozen(terms, self.t0, self.u0)
         parts = terms.terms if isinstance(terms, dfx.MultiTerm) else (terms,)
         rates = tuple(part.vf for part in parts)
         now = (self.t0, self.u0, self.args, self.step, self.t1 - self.t0)
-        return check_steps(self.amplification, rates, *now, changes, closely)
+        return check_steps(self.amplification, rates, *now, self.changes, closely)
 
     def hidden(self, last: PyTree[Array]) -> Verdict | None:
         """What made a state grow that nothing bounds, if it was steps; on the host.
 
-        They are looked at at few times before a run, where a rate depends on it.
+        Where a rate depends on time, few times are looked at before a run.
         """
-        if self.amplification is None or bool(jnp.isfinite(self.limit)):
+        if self.amplification is None or not self.changes or bool(jnp.isfinite(self.limit)):
             return None
-        if root_mean_square(last) <= _GROWN * root_mean_square(self.u0):
+        first = root_mean_square(self.u0)
+        if not 0 < _GROWN * first < root_mean_square(last):
             return None
         verdict = _judged_closely(self)
         return None if verdict is None or bool(verdict.stable) else verdict

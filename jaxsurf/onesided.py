@@ -81,9 +81,9 @@ def eliminate(
         >>> bool((closure(jnp.zeros(500)) == jnp.where(equator, 2.0, 0.0)).all())
         True
     """
-    chosen = neighbors is not None
+    of_surface = isinstance(cloud, Discretization) and neighbors is None
     if isinstance(cloud, Discretization):
-        neighbors = neighbors if chosen else cloud.neighbors
+        neighbors = cloud.neighbors if neighbors is None else neighbors
         border = cloud.border if border is None else border
         method = cloud.method if method is None else method
         cloud = cloud.cloud
@@ -109,10 +109,8 @@ def eliminate(
             b = jnp.broadcast_to(condition.b, condition.m)[own].astype(dtype)
             nu = _conormals(cloud, condition, rows, own, border)
             near = _free_neighbors(cloud, rows, free, neighbors, method)
-            w, residual = _outward_derivative(cloud, near, rows, nu, method)
-            if not chosen and _are_poor(residual):
-                near = _free_neighbors(cloud, rows, free, None, method)
-                w, residual = _outward_derivative(cloud, near, rows, nu, method)
+            others = free if of_surface else None
+            near, w, residual = _outward_derivative(cloud, near, rows, nu, method, others)
             if throw:
                 w = _checked(w, rows, near, residual, method, cloud.dim)
             pivot, slots, weights = a + b * w[0], np.asarray(near.indices).T[1:], -b * w[1:]
@@ -143,8 +141,9 @@ def without_flux(surface: Discretization) -> Closure | None:
     Differentiable: forward and reverse, in points and normals, for fixed neighbours.
     Raises:
         TypeError: no surface.
-        ValueError: on concrete arrays, neighbours off the border that do not determine a value on
-            it (named by index).
+        ValueError: neighbours off the border that do not determine a value on it (named by index;
+            others are searched for first, but in compiled code, where it is an error of the run
+            time).
 
     Example:
         >>> bowl = lambda s: (jnp.sin(s), -jnp.cos(s))
@@ -165,19 +164,18 @@ def without_flux(surface: Discretization) -> Closure | None:
     # Lists that are known stay so where points are traced, as `solve` has to know them.
     known = is_concrete(neighbors, rows)
     with at_once() if known else nullcontext():
-        near, others, bound = _without_bound(neighbors, rows)
+        own, slots, bound = _without_bound(neighbors, rows)
+    free = cloud.host_active & ~np.asarray(bound) if is_concrete(cloud, bound) else None
     nu = border.conormals(cloud)
-    w, residual = _outward_derivative(cloud, near, rows, nu, method)
-    if _are_poor(residual):
-        near = _free_neighbors(cloud, np.asarray(rows), ~np.asarray(bound), None, method)
-        others = near.indices.T[1:]
-        w, residual = _outward_derivative(cloud, near, rows, nu, method)
+    near, w, residual = _outward_derivative(cloud, own, rows, nu, method, free)
+    if near is not own:
+        slots = near.indices.T[1:]
     w = _checked(w, rows, near, residual, method, cloud.dim)
     if is_concrete(w):
         names, found = np.asarray(rows), np.asarray(w)
         size = np.abs(found).sum(axis=0)
         check_pivots(found[0], size, names, "value at point {i}: the weight w_i of its derivative")
-    return Closure(cloud.n, rows, others, _shares(w), (), bound)
+    return Closure(cloud.n, rows, slots, _shares(w), (), bound)
 
 
 @copying_jit
@@ -209,8 +207,11 @@ _GAIN, _MOST_GAIN = 10.0, 16.0
 _NEAR = 0.3
 
 
-def _outward_derivative(cloud, near: Rows, rows, conormals, method: AbstractMethod):
-    r"""Weights of $\nu\cdot\nabla_S$ at some points, `(k, m)`, and their moment residuals.
+def _outward_derivative(cloud, near: Rows, rows, conormals, method: AbstractMethod, free=None):
+    r"""Lists, weights of $\nu\cdot\nabla_S$ at some points, `(k, m)`, and their moment residuals.
+
+    Where these lists do not determine it, as on a border where they lie on few lines, those of the
+    nearest of the points that are `free`, `(n,)`, if that is given and nothing is traced.
 
     Where the surface bends within the stencil, or too little stands behind the value at the border,
     $\sum_j \eta_j (u_i - u_j)$ with positive $\eta$ over points further in, exact on linear
@@ -218,8 +219,13 @@ def _outward_derivative(cloud, near: Rows, rows, conormals, method: AbstractMeth
     extrapolate to a rough border can be a hundred times the values it comes from, and grows.
     """
     gradient, diagnostics = stencil_weights(cloud, near, method, Gradient(), rows)
+    residual = diagnostics.residual
+    if free is not None and is_concrete(residual):
+        if not (np.asarray(residual) < residual_tolerance(residual.dtype)).all():
+            near = _free_neighbors(cloud, np.asarray(rows), free, None, method)
+            return _outward_derivative(cloud, near, rows, conormals, method)
     degree = method.polynomial_degree
-    return _outward(gradient, cloud.seen, near, rows, conormals, degree), diagnostics.residual
+    return near, _outward(gradient, cloud.seen, near, rows, conormals, degree), residual
 
 
 @sized_jit
@@ -359,13 +365,6 @@ def _compacted(indices, mask, k=None):
     width = int(mask.sum(axis=1).max()) if k is None else min(k, int(mask.sum(axis=1).max()))
     order = order[:, :width]
     return np.take_along_axis(indices, order, axis=1), np.take_along_axis(mask, order, axis=1)
-
-
-def _are_poor(residual) -> bool:
-    """Whether a surface's own lists do not do, as where those on a border lie on few lines."""
-    return is_concrete(residual) and not bool(
-        (np.asarray(residual) < residual_tolerance(residual.dtype)).all()
-    )
 
 
 def _checked(w, rows, near, residual, method, dim) -> Float[Array, "k m"]:

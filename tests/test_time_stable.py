@@ -110,7 +110,7 @@ def test_steps_to_given_times_are_looked_at():
 
 
 def test_what_is_stiff_between_the_times_looked_at_is_found_as_it_grows():
-    """A damping that lasts for two steps made 6e5 of a field of size one; growth is none of it."""
+    """A damping that lasts for two steps made 5e6 of a field of size one; growth is none of it."""
     pulse = lambda t, u, args: jnp.where((t > 0.53) & (t < 0.55), -3e3, 0.0) * u
     run = lambda reaction, **given: js.integrate(
         js.AdvectionDiffusionReaction(RING, reaction=reaction), NOISE, t1=0.6, **given

@@ -18,7 +18,7 @@ class Neighborhood(eqx.Module):
     """What the stencils of a block of points see: offsets and normals of the neighbours.
 
     The centre comes first. The last axis, `*p`, is the points of the block; without it, all
-    that is made of a neighbourhood is for a single point.
+    that is made of a neighbourhood is for a single point. On a marked `border` is the centre.
     """
 
     offsets: Float[Array, "k d *p"]

@@ -194,7 +194,7 @@ def _finished(plan: Plan, run: Run, throw: bool) -> dfx.Solution:
         ended = lambda y: refuse(y, ~good, "the end was not reached")
         return eqx.tree_at(lambda s: s.ys, solution, jax.tree.map(ended, solution.ys))
     if any(bool(solution.result == r) for r in results):
-        if throw and (hidden := run.hidden(jax.tree.map(lambda leaf: leaf[-1], last))):
+        if throw and (hidden := run.hidden(last)):
             raise ValueError(_unstable(plan.name, run, hidden))
         return solution
     if verdict is not None and not bool(verdict.stable):

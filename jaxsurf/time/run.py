@@ -127,15 +127,18 @@ class Run(eqx.Module):
         now = (self.t0, self.u0, self.args, self.step, self.t1 - self.t0)
         return check_steps(self.amplification, rates, *now, self.changes, closely)
 
-    def hidden(self, last: PyTree[Array]) -> Verdict | None:
+    def hidden(self, states: PyTree[Array]) -> Verdict | None:
         """What made a state grow that nothing bounds, if it was steps; on the host.
 
         Where a rate depends on time, few times are looked at before a run.
+
+        Args:
+            states: of which the last is the end.
         """
-        if self.amplification is None or not self.changes or bool(jnp.isfinite(self.limit)):
+        if self.amplification is None or not self.changes or float(self.limit) < jnp.inf:
             return None
-        first = root_mean_square(self.u0)
-        if not 0 < _GROWN * first < root_mean_square(last):
+        last = jax.tree.map(lambda leaf: leaf[-1], states)
+        if not 0 < _GROWN * root_mean_square(self.u0) < root_mean_square(last):
             return None
         verdict = _judged_closely(self)
         return None if verdict is None or bool(verdict.stable) else verdict

@@ -51,6 +51,10 @@ class Moving(AbstractEvolution):
     pull: Callable[[Array], Array] | None = None
     problem: AbstractEvolution | None = None
 
+    @property
+    def _moves(self) -> bool:
+        return True
+
     @classmethod
     def of(
         cls,

@@ -108,7 +108,7 @@ class Chebyshev(AbstractAmplification):
             found = nth_stage(lambda _, y: z @ y, one, z, stages, max_stages=self.max_stages)
         else:
             step = Step(lambda _, y: z @ y, lambda rate: rate, one, z, self.max_stages)
-            found = step.turned(False, stages, z)[0]
+            found = step.turned(False, stages, stages, z)[0]
         return numbers.where(enough, found, numbers.nan)
 
 

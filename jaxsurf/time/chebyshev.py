@@ -10,8 +10,9 @@ Here its reverse is written out: stages are kept at intervals of about the squar
 largest number, and in between computed again.
 
 A turn of the loop makes a stage and then the rate there, that of the last one being the rate at
-the end of the step; power iterations for the spectral radius are turns of the same loop. So a rate,
-which may take seconds to compile, is compiled once.
+the end of the step; power iterations for the spectral radius are turns of the same loop, and so is
+the rate at the start where it is not known. So a rate, which may take seconds to compile, is
+compiled once.
 """
 
 from __future__ import annotations
@@ -99,11 +100,13 @@ class End(NamedTuple):
     """What a step ends with.
 
     Args:
+        rate0: the right-hand side at its start.
         y, rate: the last stage and the right-hand side there.
         radius: of which the last two follow.
         stages, enough: see `stages_of`.
     """
 
+    rate0: PyTree[Array]
     y: PyTree[Array]
     rate: PyTree[Array]
     radius: Radius
@@ -117,7 +120,7 @@ class Step(eqx.Module):
     Args:
         rate: (c, y) -> right-hand side at the time t + c Δt.
         weigh: right-hand side -> increment.
-        y0, rate0: the state, and the right-hand side there.
+        y0, rate0: the state, and the right-hand side there, or what has its shape.
         max_stages: the largest number of stages.
     """
 
@@ -127,58 +130,70 @@ class Step(eqx.Module):
     rate0: PyTree[AnyArray]
     max_stages: int = eqx.field(static=True)
 
-    def __call__(self, dt, radius: Radius, loop: Loop) -> End:
+    def __call__(self, dt, radius: Radius, fresh, loop: Loop) -> End:
         """The end of the step, of length dt.
 
         Args:
             radius: what is known of it.
+            fresh: whether the rate at the start is still to be found.
             loop: how it can be differentiated, see `RKC2`.
         """
         dt, radius = constant((jnp.abs(dt), radius))
         if loop == "checkpointed":
             rate = eqx.filter_closure_convert(self.rate, dt, self.y0)
             weigh = eqx.filter_closure_convert(self.weigh, self.rate0)
-            return _end(((rate, weigh), self.y0, self.rate0), dt, radius, self.max_stages)
+            start = (rate, weigh), self.y0, self.rate0
+            return _end(start, dt, radius, fresh, self.max_stages)
+        found = lambda: self.rate(jnp.zeros_like(dt), self.y0)
+        step = self.after(jax.lax.cond(fresh, found, lambda: self.rate0))
         if radius.direction is not None:
-            fixed = constant(self)
+            fixed = constant(step)
             start = added(fixed.rate0, radius.direction)
-            _, rate, stretched = fixed.turned(True, radius.turns, start)
+            _, rate, stretched = fixed.turned(True, 0, radius.turns, start)
             radius = constant(fixed.seen(radius, rate, stretched, radius.turns > 0))
         stages, enough = stages_of(dt * radius.value, self.max_stages)
-        y, rate, _ = self.turned(False, stages, self.rate0, loop)
-        return End(y, rate, radius, stages, enough)
+        y, rate, _ = step.turned(False, stages, stages, step.rate0, loop)
+        return End(step.rate0, y, rate, radius, stages, enough)
 
-    def end(self, dt, radius: Radius) -> End:
-        """The same by one loop: its first turn are power iterations, if any, its second stages."""
+    def after(self, rate0: PyTree[AnyArray]) -> Step:
+        """The same step from another rate."""
+        return Step(self.rate, self.weigh, self.y0, rate0, self.max_stages)
+
+    def end(self, dt, radius: Radius, fresh) -> End:
+        """The same by one loop, of at most three turns: the rate at the start, power iterations,
+        stages."""
+        further = jnp.where(jnp.asarray(radius.turns) > 0, 1, 2)
 
         def phase(carry):
             i, end = carry
-            power, radius = i == 0, end.radius
-            start, count = self.rate0, end.stages
+            step, radius, start = self.after(end.rate0), end.radius, end.rate0
             if radius.direction is not None:
                 start = added(start, radius.direction)
-                count = jnp.where(power, radius.turns, count)
-            y, rate, stretched = self.turned(power, count, start)
+            turns = jnp.stack([jnp.ones_like(end.stages), radius.turns, end.stages])[i]
+            stages = jnp.where(i == 2, end.stages, 0)
+            y, rate, stretched = step.turned(i == 1, stages, turns, start)
             if radius.direction is not None:
-                radius = self.seen(radius, rate, stretched, power)
+                radius = step.seen(radius, rate, stretched, i == 1)
+            rate0 = jax.tree.map(lambda new, old: jnp.where(i == 0, new, old), rate, end.rate0)
             stages, enough = stages_of(dt * radius.value, self.max_stages)
-            return i + 1, End(y, rate, radius, stages, enough)
+            i = jnp.where(i == 0, further, i + 1)
+            return i, End(rate0, y, rate, radius, stages, enough)
 
-        known = End(self.y0, self.rate0, radius, *stages_of(dt * radius.value, self.max_stages))
-        if radius.direction is None:
-            return phase((1, known))[1]
-        start = jnp.where(jnp.asarray(radius.turns) > 0, 0, 1), known
-        return jax.lax.while_loop(lambda carry: carry[0] < 2, phase, start)[1]
+        stages, enough = stages_of(dt * radius.value, self.max_stages)
+        known = End(self.rate0, self.y0, self.rate0, radius, stages, enough)
+        start = jnp.where(fresh, 0, further), known
+        return jax.lax.while_loop(lambda carry: carry[0] < 3, phase, start)[1]
 
-    def turned(self, power, count, rate: PyTree[Array], loop: Loop = "lax"):
-        """The last of so many power iterations or stages, the rate there, and how far that is
-        from the rate at the start where it is of a power iteration.
+    def turned(self, power, stages, turns, rate: PyTree[Array], loop: Loop = "lax"):
+        """The last of so many turns, the rate there, and how far that is from the rate at the start
+        where it is of a power iteration.
 
         Args:
-            power: whether they are that.
-            rate: for those, the rate at the start and a direction added to it.
+            power: whether turns are power iterations.
+            stages: of the step whose stages they are; 0 where they are none.
+            rate: for power iterations, the rate at the start and a direction added to it.
         """
-        rows = jnp.asarray(table(self.max_stages), dtype_of(self.y0))[jnp.where(power, 0, count)]
+        rows = jnp.asarray(table(self.max_stages), dtype_of(self.y0))[stages]
         # Constants, as the radius: at the start one is zero, where a length has no derivative.
         size = small(constant(self.y0))
         away = lambda rate: length(constant(jax.tree.map(jnp.subtract, rate, self.rate0)))
@@ -193,9 +208,9 @@ class Step(eqx.Module):
             stretched = jax.lax.cond(power, away, lambda _: stretched, rate)
             return j + 1, y, last, rate, stretched
 
-        count = jnp.asarray(count)
-        start = jnp.asarray(1, count.dtype), self.y0, self.y0, rate, away(rate)
-        unfinished = lambda carry: carry[0] <= count
+        turns = jnp.asarray(turns)
+        start = jnp.asarray(1, turns.dtype), self.y0, self.y0, rate, away(rate)
+        unfinished = lambda carry: carry[0] <= turns
         if loop == "lax":
             _, y, _, rate, stretched = jax.lax.while_loop(unfinished, turn, start)
         else:
@@ -269,21 +284,21 @@ class _Forward(eqx.Module):
 
 
 @eqx.filter_custom_vjp
-def _end(inputs, dt, radius, max_stages):
+def _end(inputs, dt, radius, fresh, max_stages):
     (rate, weigh), y0, rate0 = inputs
-    return Step(rate, weigh, y0, rate0, max_stages).end(dt, radius)
+    return Step(rate, weigh, y0, rate0, max_stages).end(dt, radius, fresh)
 
 
 @_end.def_fwd
-def _end_forward(perturbed, inputs, dt, radius, max_stages):
-    end = _end(inputs, dt, radius, max_stages)
-    return end, (end.stages, end.y)
+def _end_forward(perturbed, inputs, dt, radius, fresh, max_stages):
+    end = _end(inputs, dt, radius, fresh, max_stages)
+    return end, (end.stages, end.rate0, end.y)
 
 
 @_end.def_bwd
-def _end_reverse(residuals, cotangent, perturbed, inputs, dt, radius, max_stages):
-    functions, y0, rate0 = inputs
-    stages, y1 = residuals
+def _end_reverse(residuals, cotangent, perturbed, inputs, dt, radius, fresh, max_stages):
+    functions, y0, _ = inputs
+    stages, rate0, y1 = residuals
     parameters, fixed = eqx.partition(functions, perturbed[0])
     rows = jnp.asarray(table(max_stages), dtype_of(y0))[stages]
     rate, weigh = functions
@@ -358,7 +373,13 @@ def _end_reverse(residuals, cotangent, perturbed, inputs, dt, radius, max_stages
     k0_bar = added(k0_bar, _scaled(rows[1, _GAMMA_K], y1_bar))
     start = lambda parameters, rate0: eqx.combine(parameters, fixed)[1](rate0)
     w_part, rate0_bar = jax.vjp(start, parameters, rate0)[1](k0_bar)
-    w_bar = added(w_bar, w_part)
+    w_bar, rate0_bar = added(w_bar, w_part), added(rate0_bar, filled(cotangent.rate0, rate0))
+    # That at the start, where it was found here, is one more function of the state.
+    first = lambda parameters, y: eqx.combine(parameters, fixed)[0](rows[0, _NODE], y)
+    found = lambda: jax.vjp(first, parameters, y0)[1](rate0_bar)
+    w_part, y0_part = jax.lax.cond(fresh, found, lambda: (zero(parameters), zero(y0)))
+    w_bar, y0_bar = added(w_bar, w_part), added(y0_bar, y0_part)
+    rate0_bar = jax.tree.map(lambda bar: jnp.where(fresh, 0, bar), rate0_bar)
     return w_bar, eqx.filter(y0_bar, perturbed[1]), eqx.filter(rate0_bar, perturbed[2])
 
 

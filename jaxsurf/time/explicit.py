@@ -27,7 +27,7 @@ class _State(NamedTuple):
     """What one step hands to the next.
 
     Args:
-        rate: right-hand side at the current state.
+        rate: right-hand side at the current state; of none before the first step.
         radius: estimate of the spectral radius of its Jacobian.
         direction: field that the Jacobian stretches most.
         age: steps since the estimate; -1 before the first.
@@ -115,7 +115,9 @@ class RKC2(dfx.AbstractAdaptiveSolver):
         return terms.vf(t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args):
-        rate = terms.vf(t0, y0, args)
+        # The first step finds it, where all others do.
+        rate = jax.eval_shape(lambda: terms.vf(t0, y0, args))
+        rate = jax.tree.map(lambda k: jnp.zeros(k.shape, k.dtype), rate)
         radius, direction = self.spectral_radius, None
         if radius is None:
             radius, direction = 0, jax.tree.map(_noise, y0)
@@ -124,15 +126,14 @@ class RKC2(dfx.AbstractAdaptiveSolver):
         )
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        rate = after_jump(made_jump, solver_state.rate, lambda: terms.vf(t0, y0, args))
-        state = solver_state._replace(rate=rate)
+        state = solver_state
         span = terms.contr(t0, t1)
         weigh = lambda rate: terms.prod(rate, span)
-        step = Step(
-            lambda c, y: terms.vf(t0 + c * (t1 - t0), y, args), weigh, y0, rate, self.max_stages
-        )
-        end = step(t1 - t0, self._known(state), self.loop)
-        k0, k1 = weigh(rate), weigh(end.rate)
+        rate = lambda c, y: terms.vf(t0 + c * (t1 - t0), y, args)
+        step = Step(rate, weigh, y0, state.rate, self.max_stages)
+        fresh = jnp.asarray(made_jump) | (state.age == _UNKNOWN)
+        end = step(t1 - t0, self._known(state), fresh, self.loop)
+        k0, k1 = weigh(end.rate0), weigh(end.rate)
         y1, enough = end.y, end.enough
         error = jax.tree.map(lambda a, b, p, q: 0.8 * (a - b) + 0.4 * (p + q), y0, y1, k0, k1)
         error = jax.tree.map(lambda e: jnp.where(enough, e, jnp.inf), error)

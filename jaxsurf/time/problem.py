@@ -73,6 +73,11 @@ class AbstractEvolution(eqx.Module):
         return 0.0 if self.contractive else np.inf
 
     @property
+    def _moves(self) -> bool:
+        """True if the surface is part of the state, so that a rate is much code."""
+        return False
+
+    @property
     def active(self) -> Bool[Array | np.ndarray, " n"] | None:
         """False at points that are switched off, as its operators say; None if all are on."""
         return known_active(*vars(self).values())

@@ -13,6 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, PyTree
 
 from ..arguments import instance, real, whole, within_round_off
+from ..compiling import sized_filter_jit
 from ..failures import is_concrete, is_marking, warn
 from ..functions import Traced, canonical, constant, numbers_as_arrays
 from .amplification import AbstractAmplification, amplification_of
@@ -89,6 +90,7 @@ class Run(eqx.Module):
     max_steps: int = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
+    moving: bool = eqx.field(static=True)
 
     def over(self, u0, t0, t1, saveat: dfx.SaveAt) -> Run:
         """The same from another state over another time."""
@@ -167,9 +169,12 @@ class Plan(NamedTuple):
     filled: Traced | None
 
 
-@eqx.filter_jit
 def solve(run: Run) -> tuple[dfx.Solution, Verdict | None]:
     """The integration, and whether its steps were stable; one program for all numbers."""
+    return (_solved_moving if run.moving else _solved)(run)
+
+
+def _solution(run: Run) -> tuple[dfx.Solution, Verdict | None]:
     verdict = run.judged()
     refused = jnp.asarray(False) if verdict is None else ~verdict.stable
     solution = dfx.diffeqsolve(
@@ -189,6 +194,9 @@ def solve(run: Run) -> tuple[dfx.Solution, Verdict | None]:
         progress_meter=dfx.TqdmProgressMeter() if run.progress else dfx.NoProgressMeter(),
     )
     return solution, verdict
+
+
+_solved, _solved_moving = eqx.filter_jit(_solution), sized_filter_jit(_solution)
 
 
 def forwards() -> Any:
@@ -258,7 +266,7 @@ def planned(
         # What is stored at every step is as long as there may be steps.
         allowed = allowed if stores_steps(saveat) else most_steps(*times, allowed)
     throw = bool(throw) and not concrete and not is_marking()
-    run = Run(*parts, allowed, bool(progress), throw)
+    run = Run(*parts, allowed, bool(progress), throw, problem._moves)
     why = f"{name}: given" if why == "given" else why
     return Plan(run, name, why, concrete, filled)
 

@@ -30,8 +30,8 @@ _as_users = os.environ | {"XLA_FLAGS": os.environ["XLA_FLAGS_AS_GIVEN"], "JAXSUR
 def _optimised(level: int) -> dict[str, str]:
     """The environment of programs that are optimised little, 1, or not at all, 0."""
     flags = [f"--xla_backend_optimization_level={level}"]
-    # Spares threads where processes share the cores. A flag that is unknown ends them all.
-    flags.append("--xla_cpu_parallel_codegen_split_count=2")
+    # In one piece: other processes share the cores. A flag that is unknown ends them all.
+    flags.append("--xla_cpu_parallel_codegen_split_count=1")
     if importlib.metadata.version("jaxlib").startswith("0.10."):
         flags.append("--xla_cpu_use_fusion_emitters=false")
     flags.append(_as_users["XLA_FLAGS"])

@@ -8,6 +8,8 @@ import pytest
 
 pytestmark = pytest.mark.slow
 
+# Compiled for longer than they run.
+COMPILED = ("shape_optimisation",)
 _FOLDER = Path(__file__).parent.parent / "notebooks"
 _NOTEBOOKS = sorted(_FOLDER.glob("*.ipynb"))
 _MISSING = [name for name in ("nbclient", "ipykernel") if not importlib.util.find_spec(name)]
@@ -22,7 +24,7 @@ def test_there_are_notebooks():
 
 @pytest.mark.skipif(bool(_MISSING), reason=_NEEDED)
 @pytest.mark.parametrize("path", _NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs(path, middle_environment):
+def test_notebook_runs(path, middle_environment, quick_environment):
     import nbformat
     from nbclient import NotebookClient
 
@@ -35,6 +37,7 @@ def test_notebook_runs(path, middle_environment):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the machinery that starts kernels
         client = NotebookClient(notebook, timeout=300, resources={"metadata": {"path": _FOLDER}})
-        client.execute(env=middle_environment)
+        quick = path.stem in COMPILED
+        client.execute(env=quick_environment if quick else middle_environment)
     printed = [output.get("name") for cell in code for output in cell.outputs]
     assert "stderr" not in printed, "a cell warns"

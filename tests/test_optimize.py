@@ -156,13 +156,13 @@ def test_steps_of_a_given_length_meet_constraints():
 
 def test_what_is_bad_with_other_neighbours_is_no_end():
     """Sheets that meet are seen with neighbours found anew: nothing has converged there."""
-    flat = js.discretize(js.ellipsoid(500, (1.0, 1.0, 0.4)), method=METHOD)
+    flat = js.discretize(js.ellipsoid(250, (1.0, 1.0, 0.4)), method=METHOD)
     top = flat.cloud.points[:, 2] > 0.3
     height = lambda surface: jnp.mean(jnp.where(top, surface.cloud.points[:, 2], 0))
     for optimizer in (LBFGS, optax.sgd(20.0)):
         with pytest.raises(js.OptimizationError, match="passes through itself") as e:
             js.optimize_shape(
-                height, js.NormalShape(flat), jnp.zeros(500), optimizer=optimizer, steps=60
+                height, js.NormalShape(flat), jnp.zeros(250), optimizer=optimizer, steps=60
             )
         found = e.value.solution
         assert found.history["gradient"][-1] > 0 and not found.converged

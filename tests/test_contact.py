@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 import jaxsurf as js
 from jaxsurf.moving import follow
-from jaxsurf.moving.contact import chambers, facing, turned_over, watched
+from jaxsurf.moving.contact import apart, chambers, facing, turned_over, watched
 from jaxsurf.moving.surgery import HermiteSurface, rejoined
 
 METHOD = js.GFDM(degree=2)
@@ -232,7 +232,8 @@ def test_the_distance_of_curved_sheets():
     for n in (500, 2000):
         cloud = spheres(n, ([0, 0, -1.1], [0, 0, 1.1]), (1.0, 1.0))
         surface = js.discretize(cloud, js.find_neighbors(cloud, k=9))
-        apart = watched(js.Contact(0.2, kind="non-penetration"), cloud, surface.neighbors)[1]
+        contact, new = js.Contact(0.2, kind="non-penetration"), np.full(cloud.n, -1)
+        apart = watched(contact, cloud, surface.neighbors, new)[1]
         x, low = cloud.points, np.arange(cloud.n)[:, None] < n
         bends = jnp.eye(3) - cloud.normals[:, :, None] * cloud.normals[:, None]
         gap, out, _ = apart.gap(x, cloud.normals, bends)
@@ -267,6 +268,41 @@ def test_sheets_are_kept_apart():
     gap = cKDTree(end[low & ~off]).query(end[~low & ~off])[0]
     assert 0.95 * d < gap.min() and np.median(gap) < 1.3 * d
     np.testing.assert_array_equal(run.rows[-1][0].cloud.points[off], x[off])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("distance", [0.2, 0.3])
+def test_surfaces_stay_apart_though_they_are_near(distance):
+    """A ball in a shell, both with normals outwards, stretches it until spacings there are half of
+    the way between. (They came to share neighbours, saw each other no longer, and crossed.)"""
+    cloud = spheres(600, ([0, 0, 0], [0.1, 0.05, 0]), (1.0, 0.5))
+    ahead = jnp.array([1.0, 0.3, 0.2]) * (jnp.arange(1_200) >= 600)[:, None]
+    motion = js.Motion(lambda t, surface, fields, args: ahead)
+    contact = js.Contact(distance, kind="non-penetration")
+    run = lambda t1: js.evolve(motion, cloud, t1=t1, method=METHOD, contact=contact).clouds[-1]
+    x = np.asarray(run(0.6).points)
+    assert cKDTree(x[:600]).query(x[600:])[0].min() > distance
+    with pytest.raises(ValueError, match=r"t = 0\.6.* two sheets of the same orientation"):
+        run(1.0)
+
+
+def test_parts_stay_what_they_were():
+    """Also where lists are of both, which hold no points of the other part then."""
+    surface = js.discretize(js.sphere(300), method=METHOD)
+    before = np.where(np.asarray(surface.cloud.points[:, 0]) > 0, 1, 0)
+    new = np.arange(300) % 30 == 7
+    contact = js.Contact(0.1, kind="non-penetration")
+    with pytest.warns(UserWarning, match="distance = 0.1 is shorter than points are apart"):
+        parts = watched(contact, surface.cloud, surface.neighbors, np.where(new, -1, before))[2]
+    np.testing.assert_array_equal(parts[~new], before[~new])
+    x = np.asarray(surface.cloud.points)
+    nearest = cKDTree(x[~new]).query(x[new])[1]
+    np.testing.assert_array_equal(parts[new], before[~new][nearest])
+    lists = apart(surface, contact, parts).neighbors
+    held, mask = parts[np.asarray(lists.indices)], np.asarray(lists.mask)
+    assert (held == parts[:, None])[mask].all()
+    assert mask.sum() < np.asarray(surface.neighbors.mask).sum()
+    assert apart(surface, js.Contact(0.1), parts) is surface
 
 
 @pytest.mark.slow
@@ -314,7 +350,7 @@ def test_in_single_precision():
         x, n = one.points.astype(dtype), one.normals.astype(dtype)
         near = js.PointCloud(x, n)
         contact = js.Contact(0.5, kind="non-penetration")
-        apart = watched(contact, near, js.find_neighbors(near, k=9))[1]
+        apart = watched(contact, near, js.find_neighbors(near, k=9), np.full(near.n, -1))[1]
         bends = jnp.eye(3, dtype=dtype) - n[:, :, None] * n[:, None]
         velocity.append(apart.kept_apart(x, n, bends, -x))
     assert velocity[1].dtype == jnp.float32 and np.abs(velocity[0] - velocity[1]).max() < 1e-5

@@ -14,7 +14,10 @@ from scipy.spatial import cKDTree
 
 from ..arguments import instance, real
 from ..cloud import PointCloud
-from ..neighbors import Neighbors, Rows, first_ring
+from ..compiling import on_device
+from ..discretization import Discretization
+from ..failures import warn
+from ..neighbors import Neighbors, Rows, changed, first_ring
 
 Kind = Literal["delete", "non-penetration", "merge"]
 KINDS = get_args(Kind)
@@ -43,7 +46,8 @@ class Contact(eqx.Module):
     Args:
         distance: at which sheets touch, in length. For "delete" three to five spacings: a neck is
             that thick when it pinches off (or 1.2 times so: sheets may face each other at a slant),
-            and must still carry stencils. For the others two or more.
+            and must still carry stencils. For the others two or more, of what spacings are where
+            sheets meet: below one they may cross between points, with a warning.
         kind: "delete" cuts out what touches and closes what is left: a neck pinches off, two drops
             become one, what is thinner everywhere vanishes, and so does a part with fewer points
             than a stencil asks for. The new parts are the zero set of a smooth function that passes
@@ -165,6 +169,42 @@ def chambers(cloud: PointCloud, neighbors: Neighbors | Rows) -> Int[np.ndarray, 
     return parts
 
 
+def _parts(
+    before: Int[np.ndarray, " n"], cloud: PointCloud, neighbors: Neighbors, distance: float
+) -> Int[np.ndarray, " n"]:
+    """The chamber that each point is on: what was apart stays so, and new points are on that of the
+    nearest with such a normal."""
+    on = cloud.host_active
+    known, new = np.flatnonzero(on & (before >= 0)), np.flatnonzero(on & (before < 0))
+    if not known.size:
+        return chambers(cloud, neighbors)
+    place = np.concatenate([cloud.points, distance * np.asarray(cloud.normals)], axis=1)
+    parts = np.where(on, before, -1)
+    parts[new] = before[known[cKDTree(place[known]).query(place[new])[1]]]
+    return parts
+
+
+def apart(
+    surface: Discretization, contact: Contact | None, parts: Int[np.ndarray, " n"]
+) -> Discretization:
+    """With lists that hold no points of other parts that it is kept apart from, though these are
+    near: at rims, or where a sheet is stretched until its points are no nearer to each other."""
+    if contact is None or contact.deletes:
+        return surface
+
+    def mixed(lists: Neighbors):
+        one, other = parts[:, None], parts[np.asarray(lists.indices)]
+        return np.asarray(lists.mask) & (one != other) & (one >= 0) & (other >= 0)
+
+    def held(lists: Neighbors) -> Neighbors:
+        return Neighbors(lists.indices, lists.mask & ~on_device(mixed(lists)), lists.radius)
+
+    if not mixed(surface.neighbors).any():
+        return surface
+    lists = changed(surface.neighbors, held)
+    return Discretization(surface.cloud, lists, surface.method, surface.border)
+
+
 class Faced(eqx.Module):
     """What points are kept apart from.
 
@@ -224,22 +264,28 @@ class Faced(eqx.Module):
 
 
 def watched(
-    contact: Contact, cloud: PointCloud, neighbors: Neighbors
-) -> tuple[Float[np.ndarray, " n"], Faced | None]:
-    """How far points may go until sheets are looked at again, and what they are kept apart from."""
+    contact: Contact, cloud: PointCloud, neighbors: Neighbors, before: Int[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Faced | None, Int[np.ndarray, " n"]]:
+    """How far points may go until sheets are looked at again, what they are kept apart from, and
+    the part that each is on.
+
+    Args:
+        before: the part, at the look before; -1 for points that are new.
+    """
     if not contact.deletes:
-        return _others(contact, cloud, neighbors)
+        part = _parts(before, cloud, neighbors, float(contact.distance))
+        return *_others(contact, cloud, neighbors, part), part
     d = float(contact.distance)
     pairs, gap, _ = facing(cloud, _WATCHED * d)
     nearest = np.full(cloud.n, _WATCHED * d)
     np.minimum.at(nearest, pairs.ravel(), np.repeat(gap, 2))
-    return np.maximum((nearest - d) / 2, _LEAST * d), None
+    return np.maximum((nearest - d) / 2, _LEAST * d), None, before
 
 
-def _others(contact: Contact, cloud: PointCloud, neighbors: Neighbors):
+def _others(contact: Contact, cloud: PointCloud, neighbors: Neighbors, part):
     """The nearest points of other chambers, and of the own that face a point."""
     x, n = np.asarray(cloud.points, float), np.asarray(cloud.normals, float)
-    h, part = _spacings(cloud, neighbors), chambers(cloud, neighbors)
+    h = _spacings(cloud, neighbors)
     # Both of two sheets may come nearer by what a point may go, and slide as far.
     reach = _WATCHED * float(contact.distance) + 4 * float(h.max())
     found = [facing(cloud, reach).pairs]
@@ -258,6 +304,16 @@ def _others(contact: Contact, cloud: PointCloud, neighbors: Neighbors):
     mask = np.zeros(indices.shape, bool)
     indices[pairs[:, 0], slot], mask[pairs[:, 0], slot] = pairs[:, 1], True
     other = indices[:, 0]
+    limit, next_to = float(contact.distance), np.zeros_like(h)
+    away = np.linalg.norm(x - x[other], axis=1)
+    for label in range(part.max() + 1):
+        rows = np.flatnonzero(part == label)
+        next_to[rows] = cKDTree(x[rows]).query(x[rows], 2)[0][:, 1]
+    if np.any(mask[:, 0] & (away < _WATCHED * limit + h) & (next_to > limit)):
+        warn(
+            f"distance = {limit:.3g} is shorter than points are apart on sheets that come near "
+            "each other: they may cross between points; two spacings or more do"
+        )
     outside = np.where(np.sum((x - x[other]) * n[other], axis=1) < 0, -1.0, 1.0)
     numbers = (outside, h, contact.distance)
     side, width, distance = (jnp.asarray(a, cloud.points.dtype) for a in numbers)

@@ -25,7 +25,7 @@ from ..time.checkpoint import Checkpoint, digest, read_back, written
 from ..time.integrate import IntegrationError, integrate
 from ..time.run import planned
 from .adaptation import Adaptation, changed, conserved
-from .contact import Contact, watched
+from .contact import Contact, apart, watched
 from .problem import Moving, fitted_normals, joined, parted
 from .surgery import rejoined
 from .wear import Worn, uneven
@@ -173,6 +173,7 @@ class _Run:
         self.adapt: Adaptation | None = adapt
         self.contact: Contact | None = contact
         self.search: NeighborSearch | None = None
+        self.parts = np.full(moving.surface.n, -1)
         self.counts, self.changes = np.zeros(3, int), np.zeros((0, 6))
         self.tell: Callable = lambda t: None
         self.watch()
@@ -182,13 +183,15 @@ class _Run:
         self.moving = Moving.of(now.place.surface, self.moving.motion, self.moving.on)
         self.t, self.state, self.search = t, now.place.state, None
         self.counts, self.changes = np.asarray(now.counts), np.asarray(now.changes)
+        self.parts = np.full(len(self.parts), -1)
         self.watch()
 
     def watch(self) -> None:
         """Sheets that are near each other, from where lists were found."""
         surface, self.free = self.moving.surface, None
         if self.contact is not None:
-            free, faced = watched(self.contact, surface.cloud, surface.neighbors)
+            lists = surface.cloud, surface.neighbors, self.parts
+            free, faced, self.parts = watched(self.contact, *lists)
             free = np.where(surface.cloud.host_active, free, np.inf)
             self.free = jnp.asarray(free, surface.cloud.points.dtype)
             self.moving = Moving.of(surface, self.moving.motion, self.moving.on, faced)
@@ -340,6 +343,7 @@ class _Run:
             except ValueError as error:
                 raise ValueError(f"neighbours could not be found anew: {error}") from error
             self.search = self.room(found)
+        found = apart(found, self.contact, self.parts)
         self.moving = Moving.of(found, self.moving.motion, self.moving.on)
         self.watch()
 
@@ -362,6 +366,8 @@ class _Run:
         after, fields, added, merged = changed(after, fields, adapt, spacing)
         if not self.changed(added, merged, *met):
             return False
+        same = np.all(np.asarray(after.cloud.points) == np.asarray(surface.cloud.points), axis=1)
+        self.parts = np.where(same, self.parts, -1)
         self.begin(after)
         if adapt.conserve:
             fields = conserved(surface, old, self.moving.surface, fields)

@@ -77,6 +77,12 @@ def test_the_willmore_energy_on_the_torus():
     cloud = reference(500).cloud
     few = js.discretize(cloud, js.find_neighbors(cloud, k=40), method=js.GFDM(degree=4))
     assert js.willmore_energy(few) == few.integrate(few.mean_curvature**2)
+    # On lattices that end at a border the higher degree asks for more than it does elsewhere.
+    lattice = js.graph(lambda x, y: 0.2 * x * y, (20, 20))
+    open_ = js.discretize(lattice, method=js.GFDM(degree=4))
+    assert js.willmore_energy(open_) == open_.integrate(open_.mean_curvature**2)
+    wide = js.discretize(lattice, js.find_neighbors(lattice, k=90), method=js.GFDM(degree=4))
+    assert js.willmore_energy(wide) != wide.integrate(wide.mean_curvature**2)
 
 
 @functools.cache

@@ -28,8 +28,9 @@ from ..interpolation import beyond, distance_and_reach, nearest_points, read_fro
 from ..motion import crossed
 from ..stencils.gfdm import GFDM
 
-# Neighbours for each unknown, without which polynomials of a higher degree are no better.
-_ENOUGH = 2.5
+# Neighbours for each unknown, without which polynomials of a higher degree are no better; and
+# where all are on one side, without which they may not exist, as on lattices.
+_ENOUGH, _ONE_SIDED = 2.5, 4.5
 # Steps that lead to a foot, in the first of which the local polynomial is that of the point of the
 # cloud next to it.
 _STEPS, _FOLLOWED = 40, 10
@@ -67,7 +68,8 @@ def willmore_energy(surface: Discretization) -> Float[Array, ""]:
     With H of higher order than `surface.mean_curvature`. Curvature is a first derivative of the
     normals, and to these polynomials of even degree are no better on even points than those of
     the odd degree below: H comes from `GFDM` of the degree of the method, or one more if that is
-    even, and there are neighbours for it (2.5 for each unknown; else as the method has it).
+    even, and there are neighbours for it (2.5 for each unknown, 4.5 on surfaces with a border; else
+    as the method has it).
 
     Args:
         surface: from `js.discretize`.
@@ -92,7 +94,8 @@ def willmore_energy(surface: Discretization) -> Float[Array, ""]:
     cloud, neighbors, degree = surface.cloud, surface.neighbors, surface.method.polynomial_degree
     odd = degree + 1 - degree % 2
     unknowns = polynomial_count(cloud.dim - 1, odd) - 1
-    if neighbors.k < _ENOUGH * unknowns:
+    enough = _ENOUGH if surface.border is None else _ONE_SIDED
+    if neighbors.k < enough * unknowns:
         return surface.integrate(surface.mean_curvature**2)
     return surface.integrate(mean_curvature(cloud, neighbors, method=GFDM(degree=odd)) ** 2)
 

@@ -334,7 +334,20 @@ def _on_host(function, shapes, *arguments):
     if is_concrete(arrays):
         found = call(arrays)
         return jax.tree.map(lambda a, shape: jnp.asarray(a, shape.dtype), found, shapes)
-    return jax.pure_callback(call, shapes, arrays, vmap_method="sequential")
+
+    @jax.custom_jvp
+    def called(arrays):
+        return jax.pure_callback(call, shapes, arrays, vmap_method="sequential")
+
+    called.defjvp(_refuse_derivatives)
+    return called(arrays)
+
+
+def _refuse_derivatives(primals, tangents):
+    raise TypeError(
+        "eigenmodes and eigenvalues are differentiated once only: take differences of their first "
+        "derivatives for second ones"
+    )
 
 
 def _nothing(shape: jax.ShapeDtypeStruct) -> np.ndarray:

@@ -36,6 +36,9 @@ def sobolev_gradient(surface: Discretization, length: float) -> optax.GradientTr
 
         optimizer=optax.chain(js.sobolev_gradient(surface, 0.3), optax.sgd(0.1))
 
+    At a border s is free, $\partial_\nu s = 0$: what a `project` cuts off there to hold the border
+    is no gradient, and long steps with it may go uphill.
+
     Args:
         surface: whose points the parameters belong to, as they are when it is called.
         length: $\ell$, in units of the points.

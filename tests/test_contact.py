@@ -248,6 +248,27 @@ def test_the_distance_of_curved_sheets():
     assert errors[0] < 3e-3 and errors[1] < 0.35 * errors[0]
 
 
+def test_points_far_from_a_small_sheet_are_free():
+    """In its radii a fit of second order tells any distance."""
+    centers, radii, d = np.array([[0, 0, 0], [1.9, 0.3, 0.2]]), (1.0, 0.6), 0.3
+    cloud = spheres(400, centers, radii)
+    surface = js.discretize(cloud, js.find_neighbors(cloud, k=9))
+    contact, new = js.Contact(d, kind="merge"), np.full(cloud.n, -1)
+    apart = watched(contact, cloud, surface.neighbors, new)[1]
+    part = np.repeat([0, 1], 400)
+    bends = jnp.eye(3) - cloud.normals[:, :, None] * cloud.normals[:, None]
+    bends = bends / np.array(radii)[part][:, None, None]
+    velocity = jnp.asarray(np.array([[0, 0, 0], [-1.2, -0.2, 0]])[part])
+    change = apart.kept_apart(cloud.points, cloud.normals, bends, velocity) - velocity
+    change = np.linalg.norm(change, axis=1)
+    away = np.linalg.norm(np.asarray(cloud.points) - centers[1 - part], axis=1)
+    away -= np.array(radii)[1 - part]
+    watching, far = np.asarray(apart.mask[:, 0]), away > 2.1 * d
+    assert (watching & far).sum() > 100 and (away < 1.5 * d).sum() > 20
+    np.testing.assert_array_equal(change[far], 0)
+    assert change[away < 1.2 * d].min() > 0.4
+
+
 @pytest.mark.slow
 def test_sheets_are_kept_apart():
     """Plates whose normals point the same way, some points off; spheres are in E11."""

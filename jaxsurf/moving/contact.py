@@ -248,6 +248,12 @@ class Faced(eqx.Module):
         height = jnp.sum(away * there, axis=2, keepdims=True)
         bent = bent - height * jnp.einsum("nfab,nfb->nfa", tensor, bent)
         gap = jnp.sum(share * side * away * (there + bent / 2), axis=(1, 2))
+        # Far from a sheet, in its radii, the fit tells nothing; it is no nearer than its points
+        # are, less what may be between them.
+        between = jnp.max(jnp.where(self.mask, self.width[self.indices], 0), axis=1)
+        beyond = jnp.where(jnp.any(self.mask, axis=1), nearest[:, 0] - between**2, 0)
+        least = jnp.sqrt(jnp.where(beyond > 0, beyond, 1))
+        gap = jnp.where(beyond > 0, jnp.maximum(gap, least), gap)
         out = jnp.sum(share * side * (there + bent), axis=1)
         out = out / jnp.sqrt(jnp.maximum(jnp.sum(out**2, axis=1, keepdims=True), 0.01))
         return gap, out, share

@@ -129,9 +129,9 @@ def check_overlap(
         r, c = tight[0]
         raise ValueError(
             f"points {names[rows[r]]} and {names[slots[rows[r], c]]} lie on two sheets of the "
-            f"same orientation, {distance[r, c]:.3g} apart: their normals cannot tell them apart, "
-            f"use a smaller neighbourhood or more points (spacing {spacing[r]:.3g}, a gap of at "
-            f"least {LINK * spacing[r]:.3g} is needed)"
+            f"same orientation, {distance[r, c]:.3g} apart: their normals cannot tell them apart; "
+            f"use more points there (spacing {spacing[r]:.3g}, a gap of at least "
+            f"{LINK * spacing[r]:.3g} is needed)"
         )
 
 

@@ -48,6 +48,50 @@ def test_it_is_the_gradient_in_the_sobolev_inner_product():
     assert float(g @ s) > 0
 
 
+def test_points_are_held():
+    """The gradient among fields that are zero there; a mode of a square, zero on its rim."""
+    square = js.discretize(js.graph(lambda x, y: 0 * x, (21, 21)), method=js.GFDM(degree=2))
+    x, y, _ = np.asarray(square.cloud.points).T
+    border, length = np.asarray(square.cloud.boundary), 0.4
+    side = x.max() - x.min()
+    mode = jnp.asarray(np.cos(np.pi * x / side) * np.cos(np.pi * y / side))
+    hold = lambda held: js.sobolev_gradient(square, length, held=held)
+    smooth = hold(border)
+    s, _ = smooth.update(square.cell_areas * mode, smooth.init(mode))
+    np.testing.assert_array_equal(s[border], 0)
+    np.testing.assert_allclose(s, mode / (1 + 2 * (length * np.pi / side) ** 2), atol=5e-3)
+    rng = np.random.default_rng(0)
+    g, v = jnp.asarray(rng.normal(size=(2, square.n)))
+    some = np.flatnonzero(border & (x < 0))
+    for held in (border, some):
+        smooth = hold(held)
+        s, _ = smooth.update(g, smooth.init(g))
+        v = v.at[held].set(0)
+        product = square.cell_areas @ (s * (v - length**2 * square.symmetric_laplacian(v)))
+        np.testing.assert_allclose(product, g @ v, rtol=1e-4)
+        assert float(g @ s) > 0
+
+
+def test_a_held_border_needs_no_halved_steps():
+    """Least area over a saddle's border, from a bump: steps that a projection makes go uphill."""
+    surface = js.discretize(js.graph(lambda x, y: 0.2 * x * y, (15, 15)), method=js.GFDM(degree=2))
+    x, y, _ = surface.cloud.points.T
+    border = np.asarray(surface.cloud.boundary)
+    bump = 0.05 * jnp.cos(np.pi * x / (2 * x.max())) * jnp.cos(np.pi * y / (2 * y.max()))
+    smooth = js.sobolev_gradient(surface, 0.3, held=border)
+    found = js.optimize_shape(
+        lambda surface: surface.areas.sum(),
+        js.NormalShape(surface),
+        jnp.where(border, 0, bump),
+        optimizer=optax.chain(smooth, optax.sgd(0.05)),
+        project=lambda theta: jnp.where(border, 0, theta),
+        steps=30,
+        throw=False,
+    )
+    assert found.history["refused"].sum() == 0 and (np.diff(found.history["objective"]) < 0).all()
+    np.testing.assert_array_equal(found.theta[border], 0)
+
+
 def area_and_volume(surface):
     return surface.areas.sum() + 30 * (js.volume(surface) / (4 * jnp.pi / 3) - 1) ** 2
 

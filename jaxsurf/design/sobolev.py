@@ -5,13 +5,16 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float
 
 from ..arguments import instance, real, switched_off
+from ..boundary import Closure
+from ..conditions import Where, dirichlet, free
 from ..discretization import Discretization
 from ..failures import needs_values
+from ..onesided import eliminate
 from ..solve.precondition import AbstractPreconditioner, multigrid
 from ..solve.steady import solve
 from ..stencils.algebra import AbstractOperator
@@ -23,9 +26,12 @@ class SobolevState(NamedTuple):
     operator: AbstractOperator
     inverse: AbstractPreconditioner
     mass: Float[Array, " n"]
+    closure: Closure | None
 
 
-def sobolev_gradient(surface: Discretization, length: float) -> optax.GradientTransformation:
+def sobolev_gradient(
+    surface: Discretization, length: float, *, held: Where | None = None
+) -> optax.GradientTransformation:
     r"""Replaces derivatives at points by the gradient in a Sobolev space, for `optax.chain`.
 
     A derivative of a functional in the values of a field, g, becomes the field s with
@@ -36,12 +42,12 @@ def sobolev_gradient(surface: Discretization, length: float) -> optax.GradientTr
 
         optimizer=optax.chain(js.sobolev_gradient(surface, 0.3), optax.sgd(0.1))
 
-    At a border s is free, $\partial_\nu s = 0$: what a `project` cuts off there to hold the border
-    is no gradient, and long steps with it may go uphill.
-
     Args:
         surface: whose points the parameters belong to, as they are when it is called.
         length: $\ell$, in units of the points.
+        held: points where s and v are zero, as of a border that is not to move: a mask `(n,)` or
+            indices. At all others of a border s is free, $\partial_\nu s = 0$. (What is cut off
+            afterwards, as by a `project`, leaves a kink, and such steps may go uphill.)
 
     Returns:
         The transformation; every array of parameters has one row for each point, `(n,)` or
@@ -51,7 +57,8 @@ def sobolev_gradient(surface: Discretization, length: float) -> optax.GradientTr
         downhill. In float32 within 1e-3 (`tests/test_sobolev.py`).
     Raises:
         TypeError: no discretisation, a length that is no number.
-        ValueError: a length that is not positive; parameters of another shape; a traced surface.
+        ValueError: a length that is not positive; parameters of another shape; a traced surface;
+            points held that there are not, or all of them.
 
     Example:
         >>> surface = js.discretize(js.sphere(300), method=js.GFDM(degree=2))
@@ -65,22 +72,23 @@ def sobolev_gradient(surface: Discretization, length: float) -> optax.GradientTr
     real(length, "length", above=0)
     needs_values("surface and length", surface, length)
     operator = 1 - float(length) ** 2 * surface.symmetric_laplacian
-    inverse = multigrid(operator, mean_zero=False)
+    closure = None if held is None else _closure(surface, held)
+    inverse = multigrid(operator, closure=closure, mean_zero=False)
     mass = switched_off(surface.cloud.active, surface.cell_areas, 1)
     n = surface.n
 
     def checked(tree):
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-            if jnp.shape(leaf)[:1] != (n,):
+            if np.shape(leaf)[:1] != (n,):
                 name = jax.tree_util.keystr(path)
                 raise ValueError(
-                    f"parameters{name} have shape {jnp.shape(leaf)}, the surface has {n} points"
+                    f"parameters{name} have shape {np.shape(leaf)}, the surface has {n} points"
                 )
         return tree
 
     def init(params):
         checked(params)
-        return SobolevState(operator, inverse, mass)
+        return SobolevState(operator, inverse, mass, closure)
 
     def update(updates, state, params=None):
         return jax.tree.map(lambda g: _smoothed(state, g), checked(updates)), state
@@ -88,7 +96,17 @@ def sobolev_gradient(surface: Discretization, length: float) -> optax.GradientTr
     return optax.GradientTransformation(init, update)
 
 
+def _closure(surface: Discretization, held: Where) -> Closure:
+    """Zero at these points, and no condition at others of a border."""
+    conditions = [dirichlet(held)]
+    if surface.border is not None:
+        others = np.setdiff1d(surface.border.points, conditions[0].where)
+        conditions += [free(others.tolist())] if others.size else []
+    return eliminate(surface.cloud, conditions)
+
+
 def _smoothed(state: SobolevState, g: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
     on = state.operator.active
     per_area = switched_off(on, (g.T / state.mass).T)
-    return solve(state.operator, per_area, preconditioner=state.inverse, mean_zero=False).value
+    given = dict(closure=state.closure, preconditioner=state.inverse, mean_zero=False)
+    return solve(state.operator, per_area, **given).value  # type: ignore[arg-type]

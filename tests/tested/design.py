@@ -127,7 +127,8 @@ TESTED = {
     },
     "sobolev_gradient": {
         "value": _SOB + "test_harmonics_fall_by_their_eigenvalues, "
-        "test_sobolev.py::test_it_is_the_gradient_in_the_sobolev_inner_product",
+        "test_sobolev.py::test_it_is_the_gradient_in_the_sobolev_inner_product, "
+        "test_sobolev.py::test_points_are_held",
         "gradient": "(it transforms derivatives)",
         "jit": _SOB + "test_bumps_are_smoothed_in_free_form_and_nothing_is_compiled_between_steps",
         "vmap": _SOB + "test_single_precision_and_fields_with_components",

@@ -292,19 +292,32 @@ def test_sheets_are_kept_apart():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("distance", [0.2, 0.3])
-def test_surfaces_stay_apart_though_they_are_near(distance):
+def test_surfaces_stay_apart_though_they_are_near():
     """A ball in a shell, both with normals outwards, stretches it until spacings there are half of
     the way between. (They came to share neighbours, saw each other no longer, and crossed.)"""
     cloud = spheres(600, ([0, 0, 0], [0.1, 0.05, 0]), (1.0, 0.5))
     ahead = jnp.array([1.0, 0.3, 0.2]) * (jnp.arange(1_200) >= 600)[:, None]
     motion = js.Motion(lambda t, surface, fields, args: ahead)
-    contact = js.Contact(distance, kind="non-penetration")
+    contact = js.Contact(0.2, kind="non-penetration")
     run = lambda t1: js.evolve(motion, cloud, t1=t1, method=METHOD, contact=contact).clouds[-1]
     x = np.asarray(run(0.6).points)
-    assert cKDTree(x[:600]).query(x[600:])[0].min() > distance
+    assert cKDTree(x[:600]).query(x[600:])[0].min() > 0.2
     with pytest.raises(ValueError, match=r"t = 0\.6.* two sheets of the same orientation"):
         run(1.0)
+
+
+@pytest.mark.slow
+def test_surfaces_stay_apart_where_points_are_added():
+    """Two that grow towards each other; there are more rows in the end."""
+    cloud = spheres(200, ([-1.0, 0, 0], [1.0, 0, 0]), (0.7, 0.7))
+    grow = js.Motion(lambda t, surface, fields, args: surface.cloud.normals)
+    contact, adapt = js.Contact(0.36, kind="non-penetration"), js.Adaptation(0.18)
+    run = js.evolve(grow, cloud, t1=0.35, method=METHOD, contact=contact, adapt=adapt)
+    end = run.surfaces[-1]
+    parts, x = chambers(end.cloud, end.neighbors), np.asarray(end.cloud.points)
+    assert end.n > 600 and parts.max() == 1
+    low, high = (x[parts == label] for label in (parts[x[:, 0].argmin()], parts[x[:, 0].argmax()]))
+    assert low[:, 0].max() < 0 < high[:, 0].min() and cKDTree(low).query(high)[0].min() > 0.36
 
 
 def test_parts_stay_what_they_were():

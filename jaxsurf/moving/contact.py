@@ -184,6 +184,12 @@ def _parts(
     return parts
 
 
+def parts_after(parts: Int[np.ndarray, " n"], before, after) -> Int[np.ndarray, " m"]:
+    """The parts of rows that hold the same points as before; -1 for others, as for more rows."""
+    same = np.all(np.asarray(before) == np.asarray(after)[: len(before)], axis=1)
+    return np.pad(np.where(same, parts, -1), (0, len(after) - len(before)), constant_values=-1)
+
+
 def apart(
     surface: Discretization, contact: Contact | None, parts: Int[np.ndarray, " n"]
 ) -> Discretization:

@@ -25,7 +25,7 @@ from ..time.checkpoint import Checkpoint, digest, read_back, written
 from ..time.integrate import IntegrationError, integrate
 from ..time.run import planned
 from .adaptation import Adaptation, changed, conserved
-from .contact import Contact, apart, watched
+from .contact import Contact, apart, parts_after, watched
 from .problem import Moving, fitted_normals, joined, parted
 from .surgery import rejoined
 from .wear import Worn, uneven
@@ -366,8 +366,7 @@ class _Run:
         after, fields, added, merged = changed(after, fields, adapt, spacing)
         if not self.changed(added, merged, *met):
             return False
-        same = np.all(np.asarray(after.cloud.points) == np.asarray(surface.cloud.points), axis=1)
-        self.parts = np.where(same, self.parts, -1)
+        self.parts = parts_after(self.parts, surface.cloud.points, after.cloud.points)
         self.begin(after)
         if adapt.conserve:
             fields = conserved(surface, old, self.moving.surface, fields)

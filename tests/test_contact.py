@@ -23,6 +23,24 @@ def spheres(n, centers, radii):
     return js.PointCloud(np.concatenate(points), np.concatenate(turned))
 
 
+def killed(run, monkeypatch):
+    """What a run comes to that was killed when it first wrote its file, and went on from there."""
+
+    class Killed(Exception):
+        pass
+
+    def write_and_die(*content):
+        written(*content)
+        raise Killed
+
+    written = follow.written
+    monkeypatch.setattr(follow, "written", write_and_die)
+    with pytest.raises(Killed):
+        run("killed")
+    monkeypatch.undo()
+    return run("killed")
+
+
 def closed(surface):
     """Number of parts, from their total curvature 4 pi each, and from their lists."""
     parts = chambers(surface.cloud, surface.neighbors)
@@ -209,19 +227,7 @@ def test_a_waist_that_is_squeezed_pinches_off(tmp_path, monkeypatch):
     assert np.abs(whole.fields[-1] - 1).max() < 1e-12
     assert np.abs(end.cloud.points[:, 2]).min() > 0.1
 
-    class Killed(Exception):
-        pass
-
-    def write_and_die(*content):
-        written(*content)
-        raise Killed
-
-    written = follow.written
-    monkeypatch.setattr(follow, "written", write_and_die)
-    with pytest.raises(Killed):
-        run("killed")
-    monkeypatch.undo()
-    again = run("killed")
+    again = killed(run, monkeypatch)
     np.testing.assert_array_equal(again.changes, whole.changes)
     np.testing.assert_array_equal(again.clouds[-1].points, whole.clouds[-1].points)
 
@@ -307,13 +313,21 @@ def test_surfaces_stay_apart_though_they_are_near():
 
 
 @pytest.mark.slow
-def test_surfaces_stay_apart_where_points_are_added():
-    """Two that grow towards each other; there are more rows in the end."""
+def test_surfaces_stay_apart_where_points_are_added(tmp_path, monkeypatch):
+    """Two that grow towards each other; there are more rows in the end, also of a run that was
+    killed."""
     cloud = spheres(200, ([-1.0, 0, 0], [1.0, 0, 0]), (0.7, 0.7))
     grow = js.Motion(lambda t, surface, fields, args: surface.cloud.normals)
     contact, adapt = js.Contact(0.36, kind="non-penetration"), js.Adaptation(0.18)
-    run = js.evolve(grow, cloud, t1=0.35, method=METHOD, contact=contact, adapt=adapt)
-    end = run.surfaces[-1]
+
+    def run(name):
+        checkpoint = js.Checkpoint(tmp_path / name, every=0.3)
+        given = dict(method=METHOD, contact=contact, adapt=adapt, checkpoint=checkpoint)
+        return js.evolve(grow, cloud, t1=0.35, **given)
+
+    end = run("whole").surfaces[-1]
+    again = killed(run, monkeypatch).surfaces[-1]
+    np.testing.assert_array_equal(again.cloud.points, end.cloud.points)
     parts, x = chambers(end.cloud, end.neighbors), np.asarray(end.cloud.points)
     assert end.n > 600 and parts.max() == 1
     low, high = (x[parts == label] for label in (parts[x[:, 0].argmin()], parts[x[:, 0].argmax()]))

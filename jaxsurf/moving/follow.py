@@ -183,7 +183,7 @@ class _Run:
         self.moving = Moving.of(now.place.surface, self.moving.motion, self.moving.on)
         self.t, self.state, self.search = t, now.place.state, None
         self.counts, self.changes = np.asarray(now.counts), np.asarray(now.changes)
-        self.parts = np.full(len(self.parts), -1)
+        self.parts = np.full(now.place.surface.n, -1)
         self.watch()
 
     def watch(self) -> None:

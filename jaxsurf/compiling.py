@@ -45,17 +45,7 @@ def sized_jit(f: Callable) -> Callable:
     """
 
     thorough, quick, _ = _programs(f)
-
-    @functools.wraps(f)
-    def call(*args):
-        if _takes_longer_to_compile(jax.tree.leaves(args)):
-            try:
-                return quick(*args)
-            except ValueError:  # within another program, if only with constants
-                pass
-        return thorough(*args)
-
-    return call
+    return _by_size(f, thorough, quick)
 
 
 def sized_filter_jit(f: Callable) -> Callable:
@@ -66,12 +56,17 @@ def sized_filter_jit(f: Callable) -> Callable:
     thorough = eqx.filter_jit(f)
     less = lambda: eqx.filter_jit(f, compiler_options=_known_options())  # type: ignore[call-overload]
     quick = functools.cache(less)
+    return _by_size(f, thorough, lambda *args: quick()(*args))
+
+
+def _by_size(f: Callable, thorough: Callable, quick: Callable) -> Callable:
+    """The second of two programs of a function where the arrays are small."""
 
     @functools.wraps(f)
     def call(*args):
         if _takes_longer_to_compile(jax.tree.leaves(args)):
             try:
-                return quick()(*args)
+                return quick(*args)
             except ValueError:  # within another program, if only with constants
                 pass
         return thorough(*args)

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 import jaxsurf as js
 from jaxsurf.moving import follow
-from jaxsurf.moving.contact import apart, chambers, facing, turned_over, watched
+from jaxsurf.moving.contact import chambers, facing, turned_over, watched, without_other_parts
 from jaxsurf.moving.surgery import HermiteSurface, rejoined
 
 METHOD = js.GFDM(degree=2)
@@ -346,11 +346,11 @@ def test_parts_stay_what_they_were():
     x = np.asarray(surface.cloud.points)
     nearest = cKDTree(x[~new]).query(x[new])[1]
     np.testing.assert_array_equal(parts[new], before[~new][nearest])
-    lists = apart(surface, contact, parts).neighbors
+    lists = without_other_parts(surface, contact, parts).neighbors
     held, mask = parts[np.asarray(lists.indices)], np.asarray(lists.mask)
     assert (held == parts[:, None])[mask].all()
     assert mask.sum() < np.asarray(surface.neighbors.mask).sum()
-    assert apart(surface, js.Contact(0.1), parts) is surface
+    assert without_other_parts(surface, js.Contact(0.1), parts) is surface
 
 
 @pytest.mark.slow

@@ -108,5 +108,6 @@ def _closure(surface: Discretization, held: Where) -> Closure:
 def _smoothed(state: SobolevState, g: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
     on = state.operator.active
     per_area = switched_off(on, (g.T / state.mass).T)
-    given = dict(closure=state.closure, preconditioner=state.inverse, mean_zero=False)
-    return solve(state.operator, per_area, **given).value  # type: ignore[arg-type]
+    operator, inverse, _, closure = state
+    found = solve(operator, per_area, closure=closure, preconditioner=inverse, mean_zero=False)
+    return found.value

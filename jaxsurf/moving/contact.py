@@ -190,7 +190,7 @@ def parts_after(parts: Int[np.ndarray, " n"], before, after) -> Int[np.ndarray, 
     return np.pad(np.where(same, parts, -1), (0, len(after) - len(before)), constant_values=-1)
 
 
-def apart(
+def without_other_parts(
     surface: Discretization, contact: Contact | None, parts: Int[np.ndarray, " n"]
 ) -> Discretization:
     """With lists that hold no points of other parts that it is kept apart from, though these are
@@ -316,21 +316,24 @@ def _others(contact: Contact, cloud: PointCloud, neighbors: Neighbors, part):
     mask = np.zeros(indices.shape, bool)
     indices[pairs[:, 0], slot], mask[pairs[:, 0], slot] = pairs[:, 1], True
     other = indices[:, 0]
-    limit, next_to = float(contact.distance), np.zeros_like(h)
-    away = np.linalg.norm(x - x[other], axis=1)
-    for label in range(part.max() + 1):
-        rows = np.flatnonzero(part == label)
-        next_to[rows] = cKDTree(x[rows]).query(x[rows], 2)[0][:, 1]
-    if np.any(mask[:, 0] & (away < _WATCHED * limit + h) & (next_to > limit)):
-        warn(
-            f"distance = {limit:.3g} is shorter than points are apart on sheets that come near "
-            "each other: they may cross between points; two spacings or more do"
-        )
+    limit, away = float(contact.distance), np.linalg.norm(x - x[other], axis=1)
+    near = mask[:, 0] & (away < _WATCHED * limit + h) & (h > limit)
+    for label in np.unique(part[near]):
+        _tell_short(limit, x[part == label], x[near & (part == label)])
     outside = np.where(np.sum((x - x[other]) * n[other], axis=1) < 0, -1.0, 1.0)
     numbers = (outside, h, contact.distance)
     side, width, distance = (jnp.asarray(a, cloud.points.dtype) for a in numbers)
     lists = (jnp.asarray(indices), jnp.asarray(mask))
     return h, Faced(*lists, side, width, distance, contact.kind == "merge")
+
+
+def _tell_short(limit: float, sheet, points) -> None:
+    """Warn of a distance below the spacing of a sheet at some of its points."""
+    if np.any(cKDTree(sheet).query(points, 2)[0][:, 1] > limit):
+        warn(
+            f"distance = {limit:.3g} is shorter than points are apart on sheets that come near "
+            "each other: they may cross between points; two spacings or more do"
+        )
 
 
 def _spacings(cloud: PointCloud, neighbors: Neighbors) -> Float[np.ndarray, " n"]:

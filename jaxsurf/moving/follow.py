@@ -25,7 +25,7 @@ from ..time.checkpoint import Checkpoint, digest, read_back, written
 from ..time.integrate import IntegrationError, integrate
 from ..time.run import planned
 from .adaptation import Adaptation, changed, conserved
-from .contact import Contact, apart, parts_after, watched
+from .contact import Contact, parts_after, watched, without_other_parts
 from .problem import Moving, fitted_normals, joined, parted
 from .surgery import rejoined
 from .wear import Worn, uneven
@@ -343,7 +343,7 @@ class _Run:
             except ValueError as error:
                 raise ValueError(f"neighbours could not be found anew: {error}") from error
             self.search = self.room(found)
-        found = apart(found, self.contact, self.parts)
+        found = without_other_parts(found, self.contact, self.parts)
         self.moving = Moving.of(found, self.moving.motion, self.moving.on)
         self.watch()
 

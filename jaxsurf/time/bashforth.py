@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from .explicit import after_jump
-from .states import dtype_of
+from .states import after_jump, dtype_of
 
 
 class _State(NamedTuple):

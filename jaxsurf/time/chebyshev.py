@@ -145,7 +145,7 @@ class Step(eqx.Module):
             start = (rate, weigh), self.y0, self.rate0
             return _end(start, dt, radius, fresh, self.max_stages)
         found = lambda: self.rate(jnp.zeros_like(dt), self.y0)
-        step = self.after(jax.lax.cond(fresh, found, lambda: self.rate0))
+        step = self.with_rate(jax.lax.cond(fresh, found, lambda: self.rate0))
         if radius.direction is not None:
             fixed = constant(step)
             start = added(fixed.rate0, radius.direction)
@@ -155,7 +155,7 @@ class Step(eqx.Module):
         y, rate, _ = step.turned(False, stages, stages, step.rate0, loop)
         return End(step.rate0, y, rate, radius, stages, enough)
 
-    def after(self, rate0: PyTree[AnyArray]) -> Step:
+    def with_rate(self, rate0: PyTree[AnyArray]) -> Step:
         """The same step from another rate."""
         return Step(self.rate, self.weigh, self.y0, rate0, self.max_stages)
 
@@ -166,7 +166,7 @@ class Step(eqx.Module):
 
         def phase(carry):
             i, end = carry
-            step, radius, start = self.after(end.rate0), end.radius, end.rate0
+            step, radius, start = self.with_rate(end.rate0), end.radius, end.rate0
             if radius.direction is not None:
                 start = added(start, radius.direction)
             turns = jnp.stack([jnp.ones_like(end.stages), radius.turns, end.stages])[i]

@@ -2,7 +2,6 @@ r"""Runge–Kutta–Chebyshev: explicit steps whose stable length grows with the
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import ClassVar, NamedTuple, get_args
 
 import diffrax as dfx
@@ -126,20 +125,19 @@ class RKC2(dfx.AbstractAdaptiveSolver):
         )
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        state = solver_state
         span = terms.contr(t0, t1)
         weigh = lambda rate: terms.prod(rate, span)
         rate = lambda c, y: terms.vf(t0 + c * (t1 - t0), y, args)
-        step = Step(rate, weigh, y0, state.rate, self.max_stages)
-        fresh = jnp.asarray(made_jump) | (state.age == _UNKNOWN)
-        end = step(t1 - t0, self._known(state), fresh, self.loop)
+        step = Step(rate, weigh, y0, solver_state.rate, self.max_stages)
+        fresh = jnp.asarray(made_jump) | (solver_state.age == _UNKNOWN)
+        end = step(t1 - t0, self._known(solver_state), fresh, self.loop)
         k0, k1 = weigh(end.rate0), weigh(end.rate)
         y1, enough = end.y, end.enough
         error = jax.tree.map(lambda a, b, p, q: 0.8 * (a - b) + 0.4 * (p + q), y0, y1, k0, k1)
         error = jax.tree.map(lambda e: jnp.where(enough, e, jnp.inf), error)
         result = dfx.RESULTS.where(enough, dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence)
         dense = dict(y0=y0, y1=y1, k0=k0, k1=k1)
-        return y1, error, dense, self._later(state, end), result
+        return y1, error, dense, self._later(solver_state, end), result
 
     def _known(self, state: _State) -> Radius:
         if self.spectral_radius is not None:
@@ -153,13 +151,6 @@ class RKC2(dfx.AbstractAdaptiveSolver):
         if self.spectral_radius is None:
             age = jnp.where(jnp.asarray(end.radius.turns) > 0, 0, age)
         return _State(end.rate, end.radius.value, end.radius.direction, age + 1)
-
-
-def after_jump(made_jump, rate: PyTree[Array], fresh: Callable[[], PyTree[Array]]):
-    """The rate at the start of a step: that at the end of the one before, but after a jump."""
-    if made_jump is False:  # known when the program is made
-        return rate
-    return jax.lax.cond(jnp.asarray(made_jump), fresh, lambda: rate)
 
 
 def _noise(y: Array) -> Array:

@@ -15,10 +15,9 @@ from jaxtyping import Array, ArrayLike, PyTree
 
 from ..arguments import instance, real, whole
 from ..functions import numbers_as_arrays
-from .explicit import after_jump
 from .phases import frozen_at
 from .relative import relative, tolerance_of
-from .states import added, dtype_of, root_mean_square
+from .states import added, after_jump, dtype_of, root_mean_square
 
 Preconditioner = Callable[[Any], lx.AbstractLinearOperator]
 

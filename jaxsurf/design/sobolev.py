@@ -14,6 +14,7 @@ from ..boundary import Closure
 from ..conditions import Where, dirichlet, free
 from ..discretization import Discretization
 from ..failures import needs_values
+from ..indices import indices_of
 from ..onesided import eliminate
 from ..solve.precondition import AbstractPreconditioner, multigrid
 from ..solve.steady import solve
@@ -72,7 +73,7 @@ def sobolev_gradient(
     real(length, "length", above=0)
     needs_values("surface and length", surface, length)
     operator = 1 - float(length) ** 2 * surface.symmetric_laplacian
-    closure = None if held is None else _closure(surface, held)
+    closure = _closure(surface, held)
     inverse = multigrid(operator, closure=closure, mean_zero=False)
     mass = switched_off(surface.cloud.active, surface.cell_areas, 1)
     n = surface.n
@@ -96,11 +97,14 @@ def sobolev_gradient(
     return optax.GradientTransformation(init, update)
 
 
-def _closure(surface: Discretization, held: Where) -> Closure:
-    """Zero at these points, and no condition at others of a border."""
-    conditions = [dirichlet(held)]
+def _closure(surface: Discretization, held: Where | None) -> Closure | None:
+    """Zero at these points, and no condition at others of a border; None where there are none."""
+    rows = indices_of(() if held is None else held, surface.n, "held")
+    if not rows.size:
+        return None
+    conditions = [dirichlet(rows.tolist())]
     if surface.border is not None:
-        others = np.setdiff1d(surface.border.points, conditions[0].where)
+        others = np.setdiff1d(surface.border.points, rows)
         conditions += [free(others.tolist())] if others.size else []
     return eliminate(surface.cloud, conditions)
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import contextvars
 import functools
+import gc
 import os
+import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -37,6 +40,31 @@ def is_quick() -> bool:
     return quickly.get()
 
 
+_postponing, _thresholds, _lock = 0, gc.get_threshold(), threading.Lock()
+
+
+@contextlib.contextmanager
+def without_full_collections():
+    """Within it, in any thread, full collections of garbage wait; the young are collected as ever.
+
+    What is traced is no garbage and there is much of it: going through all objects of the process
+    again and again takes a good part of the time of tracing.
+    """
+    global _postponing, _thresholds
+    with _lock:
+        if not _postponing:
+            _thresholds = gc.get_threshold()
+            gc.set_threshold(*_thresholds[:2], 1_000_000)
+        _postponing += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _postponing -= 1
+            if not _postponing:
+                gc.set_threshold(*_thresholds)
+
+
 def sized_jit(f: Callable) -> Callable:
     """`eqx.filter_jit`, optimised less where the arrays are small and nothing is traced.
 
@@ -63,6 +91,7 @@ def _by_size(f: Callable, thorough: Callable, quick: Callable) -> Callable:
     """The second of two programs of a function where the arrays are small."""
 
     @functools.wraps(f)
+    @without_full_collections()
     def call(*args):
         if _takes_longer_to_compile(jax.tree.leaves(args)):
             try:
@@ -125,6 +154,7 @@ class Pieces:
         functools.update_wrapper(self, f)
         self.programs = _programs(f)
 
+    @without_full_collections()
     def __call__(self, blocks, *args):
         leaves = jax.tree.leaves((blocks, args))
         if len(leaves[0]) and _takes_longer_to_compile(leaves):

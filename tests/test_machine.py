@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 
@@ -70,3 +71,30 @@ def test_the_environment_may_ask_for_the_form_that_compiles_faster(said, quick, 
     about = environment | {"JAXSURF_QUICKLY": said}
     done = subprocess.run(call, env=about, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == str(quick)
+
+
+def test_full_collections_of_garbage_wait_and_come_back():
+    before = gc.get_threshold()
+    seen = []
+
+    @compiling.sized_jit
+    def looks(x):
+        seen.append(gc.get_threshold())
+        return x
+
+    @compiling.sized_jit
+    def fails(x):
+        raise RuntimeError
+
+    looks(jnp.ones(3))
+    assert [found[2] > before[2] for found in seen] == [True]
+    assert seen[0][:2] == before[:2]
+    with pytest.raises(RuntimeError):
+        fails(jnp.ones(3))
+    assert gc.get_threshold() == before
+    # Others' threads may come in between: the last one restores what the first one found.
+    first, second = compiling.without_full_collections(), compiling.without_full_collections()
+    first.__enter__(), second.__enter__(), first.__exit__(None, None, None)
+    assert gc.get_threshold()[2] > before[2]
+    second.__exit__(None, None, None)
+    assert gc.get_threshold() == before

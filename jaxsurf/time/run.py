@@ -13,7 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, PyTree
 
 from ..arguments import instance, real, whole, within_round_off
-from ..compiling import sized_filter_jit
+from ..compiling import sized_filter_jit, without_full_collections
 from ..failures import is_concrete, is_marking, warn
 from ..functions import Traced, canonical, constant, numbers_as_arrays
 from .amplification import AbstractAmplification, amplification_of
@@ -174,6 +174,7 @@ def solve(run: Run) -> tuple[dfx.Solution, Verdict | None]:
     return (_solved_moving if run.moving else _solved)(run)
 
 
+@without_full_collections()
 def _solution(run: Run) -> tuple[dfx.Solution, Verdict | None]:
     verdict = run.judged()
     refused = jnp.asarray(False) if verdict is None else ~verdict.stable

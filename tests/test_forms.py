@@ -176,6 +176,22 @@ OTHERS = {f.__name__: f for f in (refitted, solved, closed, distances, integral,
 SINGLE_GRADIENTS = {"laplace_beltrami": 1e-3}
 
 
+@pytest.mark.parametrize("method", [METHOD, js.DCPSE(order=2)], ids=["GFDM", "DCPSE"])
+def test_reverse_over_reverse_is_forward_over_reverse(method):
+    """It ended in an error of JAX: reverse mode forgets rules of derivatives in what it keeps."""
+    surface = js.discretize(CLOUD, js.find_neighbors(CLOUD, k=30), method=method)
+    along = jnp.cos(3 * CLOUD.points)
+
+    def objective(x):
+        there = surface.moved(x)
+        return jnp.mean(there.laplacian(U) ** 2) + there.integrate(U * there.mean_curvature)
+
+    slope = jax.grad(objective)
+    twice = jax.jit(jax.grad(lambda x: jnp.vdot(slope(x), along)))(CLOUD.points)
+    expected = jax.jit(lambda x: jax.jvp(slope, (x,), (along,))[1])(CLOUD.points)
+    np.testing.assert_allclose(twice, expected, atol=1e-11 * float(jnp.abs(expected).max()))
+
+
 @pytest.mark.parametrize("name", [*OPERATORS, *CURVATURES, *OTHERS])
 def test_gradients_in_single_precision(name):
     """In the points (and normals that follow them), to 1e-2 of the gradient in 64 bits."""

@@ -185,6 +185,20 @@ def test_derivatives_of_a_bounded_loop():
     np.testing.assert_allclose(found, usual, rtol=1e-12)
 
 
+@pytest.mark.parametrize("twice", [jax.hessian, lambda f: jax.grad(jax.grad(f))])
+def test_second_derivatives(twice):
+    """An error of JAX: derivatives went through power iterations, by what the rate closes over."""
+
+    def size(factor):
+        problem = js.AdvectionDiffusionReaction(LAPLACIAN, diffusivity=factor)
+        how = dict(t1=0.1, dt0=0.02, solver=js.RKC2(), max_steps=8, adjoint=dfx.DirectAdjoint())
+        return jnp.mean(js.integrate(problem, CLOUD.points[:, 2], **how).ys[-1] ** 2)
+
+    # Of the mean of z² exp(-4 factor t).
+    value, found = jax.jit(lambda x: (size(x), twice(size)(x)))(1.0)
+    np.testing.assert_allclose(found, 0.4**2 * value, rtol=2e-2)
+
+
 def test_states_of_several_parts_and_batches():
     u0 = jnp.exp(CLOUD.points[:, 2])
     term = dfx.ODETerm(lambda t, y, args: (LAPLACIAN(y[0]), LAPLACIAN(y[1])))

@@ -109,6 +109,80 @@ def test_steps_to_given_times_are_looked_at():
     js.integrate(problem, NOISE, t1=0.5, controller=fine, solver=dfx.Tsit5())
 
 
+class Midpoint(dfx.AbstractSolver):
+    """A solver of one's own; with a matrix of the problem it is no function of its terms."""
+
+    matrix: jax.Array | None = None
+
+    term_structure = dfx.AbstractTerm
+    interpolation_cls = dfx.LocalLinearInterpolation
+
+    def order(self, terms):
+        return 2
+
+    def init(self, terms, t0, t1, y0, args):
+        return None
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        y0 = y0 if self.matrix is None else self.matrix @ y0
+        half = y0 + terms.vf_prod(t0, y0, args, terms.contr(t0, t1)) / 2
+        y1 = y0 + terms.vf_prod((t0 + t1) / 2, half, args, terms.contr(t0, t1))
+        return y1, None, dict(y0=y0, y1=y1), None, dfx.RESULTS.successful
+
+
+class Growing(dfx.AbstractStepSizeController):
+    """A controller of one's own, whose steps grow up to a length, whatever their errors."""
+
+    longest: float
+
+    def wrap(self, direction):
+        return self
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        return t0 + 0.01, None
+
+    def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, state):
+        end = t1 + jnp.minimum(1.3 * (t1 - t0), self.longest)
+        return jnp.asarray(True), t1, end, jnp.asarray(False), state, dfx.RESULTS.successful
+
+
+def test_a_solver_of_ones_own_is_looked_at():
+    """Fields came back with values of 2e13; nothing bounds what a reaction may make of them."""
+    heat = js.AdvectionDiffusionReaction(RING, reaction=lambda t, u, args: 0.2 * u)
+    limit = 2 / (4 / float(ANGLES[1]) ** 2 - 0.2)
+    run = lambda dt, solver: js.integrate(heat, NOISE, t1=200 * dt, dt0=dt, solver=solver)
+    assert float(jnp.abs(run(0.95 * limit, Midpoint()).ys[-1]).max()) < 10
+    with pytest.raises(
+        ValueError, match=rf"Midpoint is stable up to {limit:.2g}.*Shorter steps, or js.RKC2"
+    ):
+        run(1.1 * limit, Midpoint())
+    # Nothing can be said of this one, and nothing is.
+    assert run(0.95 * limit, Midpoint(jnp.eye(24))).result == dfx.RESULTS.successful
+
+
+@pytest.mark.parametrize("solver", [dfx.Heun(), Midpoint(), js.IMEX(order=2)])
+def test_steps_of_a_controller_of_ones_own_are_watched(solver):
+    """Fields came back with values of 2e9 to 2e13, from zero too."""
+    pushed = lambda t, u, args: 0.2 * u + jnp.cos(5 * ANGLES)
+    fast = turning(30 * TURN, reaction=pushed)
+    for start in (NOISE, 0 * NOISE):
+        run = lambda longest, problem=fast, start=start, **given: js.integrate(
+            problem, start, t1=8.0, solver=solver, controller=Growing(longest), **given
+        )
+        with pytest.raises(js.IntegrationError, match=r"stable in steps up to .*=Growing"):
+            run(0.4)
+        assert run(0.4, throw=False).result == dfx.RESULTS.nonlinear_divergence
+    code = jax.jit(lambda u: run(0.4, start=u, throw=False).result)
+    assert code(NOISE) == dfx.RESULTS.nonlinear_divergence
+    # What grows by itself is left alone, by a hundredfold too.
+    growth = js.AdvectionDiffusionReaction(RING, reaction=lambda t, u, args: u)
+    end = run(0.03, growth, 1 + 0 * NOISE).ys[-1]
+    np.testing.assert_allclose(end, np.exp(8.0), rtol=5e-3)
+
+
 def test_what_is_stiff_between_the_times_looked_at_is_found_as_it_grows():
     """A damping that lasts for two steps made 5e6 of a field of size one; growth is none of it."""
     pulse = lambda t, u, args: jnp.where((t > 0.53) & (t < 0.55), -3e3, 0.0) * u

@@ -89,11 +89,15 @@ def _soft_radius(r2, mask, target, dim):
 def _log_radius(r2, mask, target):
     """Where the weights `_counted` add up to the target; derivatives, of any order, in r2."""
 
+    # Reverse mode takes the rule below off what it keeps. To be differentiated once more, that is a
+    # step from where the loop ends, which is no function of anything.
+    still = jax.lax.stop_gradient(r2)
+
     def newton(state):
         # In an even set log(count) is a straight line in t = log(radius), nearly; where a step
         # leaves the bracket, it is halved instead.
         low, high, t, _, steps = state
-        value, slope = _counted(r2, mask, t)
+        value, slope = _counted(still, mask, t)
         low, high = jnp.where(value < target, t, low), jnp.where(value < target, high, t)
         step = t + jnp.log(target / value) * value / jnp.maximum(slope, 1e-3 * value)
         inside = (step >= low) & (step <= high)
@@ -106,7 +110,7 @@ def _log_radius(r2, mask, target):
 
     # A disc that is filled evenly out to the radius R has a mean r^2 of R^2 / 2, a ball of any
     # dimension about that; the share of the list that is wanted takes part of it.
-    mean = total(jnp.where(mask, r2, 0)) / total(mask)
+    mean = total(jnp.where(mask, still, 0)) / total(mask)
     start = 0.5 * jnp.log(jnp.where(mean > 0, 2 * _SHARE * mean, 1))
     infinite = jnp.asarray(jnp.inf, r2.dtype)
     t = jax.lax.while_loop(moving, newton, (start - 5, start + 5, start, infinite, 0))[2]

@@ -17,7 +17,7 @@ from ..compiling import AnyArray, namespace
 from .bashforth import AdamsBashforth2
 from .chebyshev import SAFETY, Step, nth_stage, stages_of
 from .explicit import RKC2
-from .implicit import IMEX
+from .implicit import IMEX, SDIRK
 
 Rows = tuple[tuple[float, ...], ...]
 
@@ -149,11 +149,43 @@ class Halved(AbstractAmplification):
         return half @ half
 
 
-def amplification_of(solver: dfx.AbstractSolver) -> AbstractAmplification | None:
-    """That of a solver that is explicit, in part or whole; None for another."""
+class Measured(AbstractAmplification):
+    """A solver of one's own: its first step."""
+
+    solver: dfx.AbstractSolver
+
+    def __call__(self, dt, parts):
+        found = _first_step(self.solver, *jax.tree.map(jnp.asarray, (dt, list(parts))))
+        return np.asarray(found) if isinstance(parts[0], np.ndarray) else found
+
+
+@eqx.filter_jit
+def _first_step(solver, dt, parts):
+    term_of = lambda z: dfx.ODETerm(lambda t, y, args: z @ y / dt)
+    term = term_of(*parts) if len(parts) == 1 else dfx.MultiTerm(*map(term_of, parts))
+    start, times = _one(parts[0]), (jnp.zeros_like(dt), dt)
+    state = solver.init(term, *times, start, None)
+    return solver.step(term, *times, start, None, state, jnp.asarray(False))[0]
+
+
+def _is_general(solver: dfx.AbstractSolver, parts: int) -> bool:
+    """Whether a solver takes a step of any matrices; one that knows its problem may not."""
+    z = jnp.zeros((2, 2))
+    try:
+        jax.eval_shape(_first_step, solver, z[0, 0], [z] * parts)
+    except Exception:  # whatever somebody else's step runs into
+        return False
+    return True
+
+
+def amplification_of(solver: dfx.AbstractSolver, parts: int = 1) -> AbstractAmplification | None:
+    """That of a solver that is explicit, in part or whole, on so many parts of a right-hand side.
+
+    None for an implicit one, and for one of one's own that is no function of what it is given.
+    """
     # (A solver that wraps another says that it is of the kind of that.)
     if type(solver) is dfx.HalfSolver:
-        step = amplification_of(solver.solver)
+        step = amplification_of(solver.solver, parts)
         return None if step is None else Halved(step)
     if isinstance(solver, RKC2):
         return Chebyshev(solver.spectral_radius, solver.max_stages)
@@ -182,7 +214,9 @@ def amplification_of(solver: dfx.AbstractSolver) -> AbstractAmplification | None
             _rows(explicit.a_lower), _rows(implicit.a_lower), _numbers(implicit.a_diagonal[1:]),
             (_numbers(explicit.b_sol), _numbers(implicit.b_sol)),
         )  # fmt: skip
-    return None
+    if isinstance(solver, dfx.AbstractImplicitSolver | SDIRK) or not _is_general(solver, parts):
+        return None
+    return Measured(solver)
 
 
 def log_radius(matrix: Float[AnyArray, "m m"]) -> Any:

@@ -209,3 +209,28 @@ def check_tolerances(controller: dfx.AbstractStepSizeController, dtype) -> None:
         real(value, f"controller.{name}", least=0)
     if not numbers["atol"] > 0:
         within_round_off(numbers["rtol"], dtype, "controller.rtol")
+
+
+def check_adjoint(adjoint) -> None:
+    """Refuse what solves backwards, or differentiates the state at rest alone."""
+    if isinstance(adjoint, dfx.BacksolveAdjoint | dfx.ImplicitAdjoint):
+        raise ValueError(
+            f"adjoint={type(adjoint).__name__} does not differentiate what is saved here: "
+            "RecursiveCheckpointAdjoint, DirectAdjoint and ForwardMode of diffrax do"
+        )
+
+
+def check_solver(solver: dfx.AbstractSolver, controller) -> None:
+    """Refuse solvers of other equations, and a choice of steps by errors that are not estimated."""
+    name = type(solver).__name__
+    if isinstance(solver.term_structure, tuple):
+        raise ValueError(
+            f"solver={name} steps {len(solver.term_structure)} unknowns by turns, each by a "
+            "right-hand side of its own: the state of a problem has one"
+        )
+    adaptive = isinstance(controller, dfx.AbstractAdaptiveStepSizeController)
+    if adaptive and not isinstance(solver, dfx.AbstractAdaptiveSolver):
+        raise ValueError(
+            f"solver={name} estimates no error that would choose the steps: pass their length as "
+            "dt0"
+        )

@@ -139,13 +139,14 @@ class Step(eqx.Module):
             loop: how it can be differentiated, see `RKC2`.
         """
         dt, radius = constant((jnp.abs(dt), radius))
+        # With what they hang on, which also is to be constant in power iterations.
+        rate = eqx.filter_closure_convert(self.rate, dt, self.y0)
+        weigh = eqx.filter_closure_convert(self.weigh, self.rate0)
         if loop == "checkpointed":
-            rate = eqx.filter_closure_convert(self.rate, dt, self.y0)
-            weigh = eqx.filter_closure_convert(self.weigh, self.rate0)
             start = (rate, weigh), self.y0, self.rate0
             return _end(start, dt, radius, fresh, self.max_stages)
-        found = lambda: self.rate(jnp.zeros_like(dt), self.y0)
-        step = self.with_rate(jax.lax.cond(fresh, found, lambda: self.rate0))
+        rate0 = jax.lax.cond(fresh, lambda: rate(0 * dt, self.y0), lambda: self.rate0)
+        step = Step(rate, weigh, self.y0, rate0, self.max_stages)
         if radius.direction is not None:
             fixed = constant(step)
             start = added(fixed.rate0, radius.direction)

@@ -2,7 +2,7 @@ r"""Step size controllers that stop where a solution leaves what it can be."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -10,7 +10,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .stability import Watch
 from .states import root_mean_square
+
+# Where nothing bounds what a state may be, one that has grown by this factor is looked at.
+GROWN = 100.0
 
 
 class Guard(eqx.Module):
@@ -19,15 +23,42 @@ class Guard(eqx.Module):
     Args:
         limit: the largest root mean square of a state; infinite for none.
         refused: True if no step is to be taken at all.
+        watch: on steps whose lengths a controller chooses that knows no errors.
     """
 
     limit: Float[Array, ""]
     refused: Bool[Array, ""]
+    watch: Watch | None
 
     def stops(self, y: PyTree[Array]) -> Bool[Array, ""]:
         """True if entries are not finite or too large together."""
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(y)]
         return ~(jnp.all(jnp.stack(finite)) & (root_mean_square(y) <= self.limit)) | self.refused
+
+
+class _Seen(NamedTuple):
+    """What is known of the steps that are watched.
+
+    Args:
+        state: of the controller.
+        size: the root mean square at the start, of the first state that is not zero.
+        excess: logarithm of how much they have amplified a mode beyond what the equation does.
+    """
+
+    state: Any
+    size: Float[Array, ""]
+    excess: Float[Array, ""]
+
+    def after(self, state, keep, y, excess) -> _Seen:
+        """A step."""
+        first = keep & (self.size == 0)
+        size = jnp.where(first, root_mean_square(y), self.size)
+        return _Seen(state, size, self.excess + jnp.where(keep, excess, 0))
+
+    def accuses(self, y: PyTree[Array]) -> Bool[Array, ""]:
+        """True if the state has grown much, and not beyond what the steps may have made of it."""
+        grown = root_mean_square(y) / jnp.where(self.size > 0, self.size, 1)
+        return (grown > GROWN) & (self.excess > jnp.log(grown))
 
 
 class Guarded(dfx.AbstractStepSizeController):
@@ -45,15 +76,24 @@ class Guarded(dfx.AbstractStepSizeController):
         return type(self)(self.controller.wrap(direction), self.guard)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        if self.guard.watch is not None:
+            size = root_mean_square(y0)
+            state = _Seen(state, size, jnp.zeros_like(size))
+        return end, state
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state):
         numbers = lambda y: jnp.where(jnp.isfinite(y), y, jnp.nan)
         tried = jax.tree.map(numbers, y1_candidate)
+        watch, seen = self.guard.watch, state
+        own = state if watch is None else seen.state
         keep, start, end, jump, new_state, result = self.controller.adapt_step_size(
-            t0, t1, y0, tried, args, y_error, error_order, state
+            t0, t1, y0, tried, args, y_error, error_order, own
         )
         stop = keep & self.guard.stops(y1_candidate) | self.guard.refused
+        if watch is not None:
+            new_state = seen.after(new_state, keep, y1_candidate, watch.excess(t1 - t0))
+            stop = stop | keep & new_state.accuses(y1_candidate)
         result = dfx.RESULTS.where(stop, dfx.RESULTS.nonlinear_divergence, result)
         return keep & ~stop, jnp.where(stop, t0, start), end, jump, new_state, result
 

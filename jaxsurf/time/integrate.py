@@ -111,14 +111,15 @@ def integrate(
         ValueError: a state that is not finite, or for which the right-hand side is not; steps of
             given length that are explicit, in part or whole, beyond the limit of stability (with
             step, limit and spectral radius; of a rate that depends on time at six times, and at 128
-            where the state has grown a hundredfold after all); diffusion backwards in time; a
-            border about which nothing is said; tolerances out of range; times or steps that are
-            lost in the precision of the state; a linear part of a problem of one's own that is not
-            linear; a checkpoint that is of another run or damaged.
+            where the state has grown a hundredfold after all; of a solver of one's own as its first
+            step tells); diffusion backwards in time; a border about which nothing is said;
+            tolerances out of range; times or steps that are lost in the precision of the state; a
+            linear part of a problem of one's own that is not linear; a checkpoint that is of
+            another run or damaged.
         IntegrationError: the end was not reached: the solution diverges (or grows a hundredfold
-            where the equation lets none grow), the tolerance cannot be met, a linear system does
-            not converge. Holds the last good state. (Under
-            `jit` an error of the run time.)
+            where the equation lets none grow, or where steps whose length a controller of one's own
+            chooses amplify a mode as much), the tolerance cannot be met, a linear system does not
+            converge. Holds the last good state. (Under `jit` an error of the run time.)
 
     Example:
         >>> cloud = js.sphere(500)
@@ -240,10 +241,11 @@ def _unstable(name: str, run: Run, verdict: Verdict) -> str:
     when = "" if verdict.time == run.t0 else f" at t = {float(verdict.time):.3g}"
     stable = f"is stable up to {limit:.3g}" if limit else "is stable for no step here"
     what = "explicit part of the right-hand side" if split else "right-hand side"
-    better = "no dt0 (steps are then adapted)" if given else "a controller that adapts them"
-    better = f"shorter steps, or {better}" if limit else better
-    for other in () if split else ("RKC2", "IMEX"):
-        better += "" if other == name else f", or js.{other}()"
+    ways = ["shorter steps"] if limit else []
+    if isinstance(run.solver, dfx.AbstractAdaptiveSolver):
+        ways += ["no dt0 (steps are then adapted)" if given else "a controller that adapts them"]
+    ways += [f"js.{other}()" for other in ("RKC2", "IMEX") if other != name and not split]
+    better = ", or ".join(ways) or "another solver"
     return (
         f"{step} is unstable{when}: {name} {stable}, the spectral radius of the {what} is "
         f"{radius:.3g}; {'longer' if limit else 'these'} steps multiply its fastest mode by "
@@ -278,6 +280,13 @@ def _reason(plan: Plan, run: Run, solution: dfx.Solution, t: float, state) -> st
     reason = next((text for code, text in why if solution.result == code), None)
     if reason is None:
         reason = f"a linear system was not solved ({dfx.RESULTS[solution.result]})"  # type: ignore[misc]
+    if run.amplification is not None and run.step is None:
+        span = abs(float(run.t1 - run.t0))
+        longest, radius = run.checked(span).longest(run.amplification, span, span)
+        reason += (
+            f" (it is stable in steps up to {longest:.3g}, the spectral radius is {radius:.3g}; "
+            f"controller={type(run.controller).__name__} may have chosen longer ones)"
+        )
     if float(run.limit) < jnp.inf:
         reason += f" (no solution of this problem grows beyond {run.limit:.3g})"
     return (

@@ -18,9 +18,11 @@ from ..failures import is_concrete, is_marking, warn
 from ..functions import Traced, canonical, constant, numbers_as_arrays
 from .amplification import AbstractAmplification, amplification_of
 from .asked import (
+    check_adjoint,
     check_coefficients,
     check_linear,
     check_saves,
+    check_solver,
     check_tolerances,
     checked_rate,
     checked_state,
@@ -29,12 +31,12 @@ from .asked import (
 )
 from .chebyshev import Loop
 from .explicit import RKC2
-from .guard import Guard, guarded
+from .guard import GROWN, Guard, guarded
 from .loops import COPIES, RecursiveCheckpoints, count_steps, most_steps
 from .phases import Linear, Rest, frozen, has_phases
 from .problem import AbstractEvolution, checked_problem
 from .saving import closed_saves, ending, filling, stores_steps
-from .stability import Verdict, check_steps
+from .stability import Verdict, Watch, check_steps
 from .states import Norm, root_mean_square
 
 _log = logging.getLogger(__name__)
@@ -45,8 +47,6 @@ _forwards = jax.make_user_context(default_value=False)
 _SHORTEST = 1e-11
 # Steps that are allowed when the number that are stored does not grow with it, and otherwise.
 _MANY_STEPS, _STORED_STEPS = 10_000_000, 4096
-# Where no solution grows, one that does by this factor is none.
-_GROWN = 100.0
 
 
 def choose_solver(problem: AbstractEvolution) -> tuple[dfx.AbstractSolver, str]:
@@ -101,16 +101,18 @@ class Run(eqx.Module):
     @property
     def step(self) -> Array | None:
         """The length of the steps if it is given: of the longest if they differ."""
-        if isinstance(self.controller, dfx.StepTo):
-            return jnp.max(jnp.abs(jnp.diff(self.controller.ts)))
-        adaptive = isinstance(self.controller, dfx.AbstractAdaptiveStepSizeController)
-        return None if adaptive else self.dt0
+        controller = _clipped(self.controller)
+        if isinstance(controller, dfx.StepTo):
+            return jnp.max(jnp.abs(jnp.diff(controller.ts)))
+        return self.dt0 if isinstance(controller, dfx.ConstantStepSize) else None
 
     @property
     def amplification(self) -> AbstractAmplification | None:
-        """Of the steps, if they are explicit, in part or whole, and of given length: these can be
-        unstable."""
-        return None if self.step is None else amplification_of(self.solver)
+        """Of the steps, if they are explicit, in part or whole, and nothing sees their errors:
+        these can be unstable."""
+        if isinstance(_clipped(self.controller), dfx.AbstractAdaptiveStepSizeController):
+            return None
+        return amplification_of(self.solver, 1 + _takes_two(self.solver))
 
     @property
     def changes(self) -> bool:
@@ -119,15 +121,31 @@ class Run(eqx.Module):
 
     def judged(self, closely: bool = False) -> Verdict | None:
         """Whether they are; None if they cannot be. Closely: at many times."""
-        if self.amplification is None:
+        if self.amplification is None or self.step is None:
             return None
+        return self.checked(self.step, closely)
+
+    def checked(self, dt, closely: bool = False) -> Verdict:
+        """The same for steps of some length, where they can be unstable."""
+        assert self.amplification is not None
+        now = (self.t0, self.u0, self.args, dt, self.t1 - self.t0)
+        return check_steps(self.amplification, self.rates, *now, self.changes, closely)
+
+    def watched(self) -> Watch | None:
+        """A watch on steps whose length a controller chooses that knows no errors."""
+        if self.amplification is None or self.step is not None:
+            return None
+        now = (self.t0, self.u0, self.args, self.t1 - self.t0)
+        return Watch.over(self.amplification, self.rates, *now, self.changes)
+
+    @property
+    def rates(self) -> tuple:
+        """The right-hand side, or its parts, with what is frozen for a step as at the start."""
         terms = self.terms
         if has_phases(terms):
             terms = frozen(terms, self.t0, self.u0)
         parts = terms.terms if isinstance(terms, dfx.MultiTerm) else (terms,)
-        rates = tuple(part.vf for part in parts)
-        now = (self.t0, self.u0, self.args, self.step, self.t1 - self.t0)
-        return check_steps(self.amplification, rates, *now, self.changes, closely)
+        return tuple(part.vf for part in parts)
 
     def hidden(self, states: PyTree[Array]) -> Verdict | None:
         """What made a state grow that nothing bounds, if it was steps; on the host.
@@ -137,10 +155,11 @@ class Run(eqx.Module):
         Args:
             states: of which the last is the end.
         """
-        if self.amplification is None or not self.changes or float(self.limit) < jnp.inf:
+        known = self.amplification is None or self.step is None
+        if known or not self.changes or float(self.limit) < jnp.inf:
             return None
         last = jax.tree.map(lambda leaf: leaf[-1], states)
-        if not 0 < _GROWN * root_mean_square(self.u0) < root_mean_square(last):
+        if not 0 < GROWN * root_mean_square(self.u0) < root_mean_square(last):
             return None
         verdict = _judged_closely(self)
         return None if verdict is None or bool(verdict.stable) else verdict
@@ -187,7 +206,7 @@ def _solution(run: Run) -> tuple[dfx.Solution, Verdict | None]:
         run.u0,
         run.args,
         saveat=run.saveat,
-        stepsize_controller=guarded(run.controller, Guard(run.limit, refused)),
+        stepsize_controller=guarded(run.controller, Guard(run.limit, refused, run.watched())),
         adjoint=run.adjoint,
         event=run.event,
         max_steps=run.max_steps,
@@ -222,6 +241,7 @@ def planned(
     ):  # fmt: skip
         if value is not None:
             instance(value, kind, name, f"an object of diffrax or jaxsurf, like {_LIKE[name]}")
+    check_adjoint(adjoint)
     why = "given"
     if solver is None:
         solver, why = choose_solver(problem)
@@ -239,7 +259,7 @@ def planned(
     elif controller is None:
         controller = dfx.ConstantStepSize()
     check_tolerances(controller, t0.dtype)
-    _check_estimates(solver, controller)
+    check_solver(solver, controller)
     saveat = check_saves(dfx.SaveAt(t1=True) if saveat is None else saveat, t0, t1)
     allowed = _allowed(max_steps, saveat, t0, t1, dt0, controller)
     check_coefficients(problem, t0, t1)
@@ -270,16 +290,6 @@ def planned(
     run = Run(*parts, allowed, bool(progress), throw, problem._moves)
     why = f"{name}: given" if why == "given" else why
     return Plan(run, name, why, concrete, filled)
-
-
-def _check_estimates(solver: dfx.AbstractSolver, controller) -> None:
-    """Refuse a choice of steps by errors that are not estimated."""
-    adaptive = isinstance(controller, dfx.AbstractAdaptiveStepSizeController)
-    if adaptive and not isinstance(solver, dfx.AbstractAdaptiveSolver):
-        raise ValueError(
-            f"solver={type(solver).__name__} estimates no error that would choose the steps: pass "
-            "their length as dt0"
-        )
 
 
 _LIKE = dict(
@@ -344,13 +354,20 @@ def _limit(u0, growth, t0: Array, t1: Array) -> Array:
     size = root_mean_square(u0)
     # (Infinite times nothing would be no number.)
     grown = jnp.where(jnp.isfinite(growth), jnp.exp(growth * jnp.abs(t1 - t0)), jnp.inf)
-    return jnp.where(size > 0, _GROWN * size * grown, jnp.where(jnp.isfinite(grown), 0, jnp.inf))
+    return jnp.where(size > 0, GROWN * size * grown, jnp.where(jnp.isfinite(grown), 0, jnp.inf))
 
 
 @jax.jit
 def _shortest(t0: Array, t1: Array) -> Array:
     """A step that is not worth trying: much shorter than all, or lost in the time."""
     return jnp.maximum(_SHORTEST * jnp.abs(t1 - t0), resolved(t0, t1))
+
+
+def _clipped(controller: dfx.AbstractStepSizeController) -> dfx.AbstractStepSizeController:
+    """What chooses the steps that another cuts off at some times."""
+    if isinstance(controller, dfx.ClipStepSizeController):
+        return _clipped(controller.controller)
+    return controller
 
 
 def _with_arrays(controller: dfx.AbstractStepSizeController):

@@ -63,6 +63,40 @@ class Verdict(eqx.Module):
         return 0.0, radius
 
 
+class Watch(eqx.Module):
+    """For steps whose lengths are not known before they are taken.
+
+    Args:
+        step: of the method.
+        projected: as in `Verdict`, at several times: `(times, m, m)`.
+    """
+
+    step: AbstractAmplification
+    projected: tuple[Float[Array, "t m m"], ...]
+
+    @classmethod
+    def over(cls, step, rates, t0, u, args, span, changes: bool) -> Watch:
+        """Of a run; see `check_steps`."""
+        rates, t0, u, args, span = constant((rates, t0, u, args, span))
+        at = lambda t: tuple(jnp.sign(span) * part for part in projected(rates, t, u, args))
+        places = jnp.asarray(_PLACES if changes else _PLACES[:1], t0.dtype)
+        return cls(constant(step), jax.lax.map(at, t0 + span * places))
+
+    def excess(self, dt) -> Array:
+        """Logarithm of the amplification of the worst mode in a step beyond what it should be."""
+        beyond = lambda parts: jnp.subtract(*_excess(self.step, jnp.abs(dt), parts))
+        return jnp.maximum(jnp.max(jax.lax.map(beyond, self.projected)), 0)
+
+
+def _excess(step: AbstractAmplification, dt, parts) -> tuple[Array, Array]:
+    """Logarithm of the amplification of a mode beyond what it should be, and its round-off."""
+    z = dt * functools.reduce(jnp.add, parts)
+    size = jnp.maximum(jnp.max(jnp.sum(jnp.abs(z), axis=1)), 1)
+    grown = jnp.maximum(size * log_radius(_exponential(z / size)), 0)
+    excess = log_radius(step(dt, [dt * part for part in parts])) - grown
+    return excess, 50 * jnp.finfo(z.dtype).eps * size
+
+
 def check_steps(
     step: AbstractAmplification,
     rates: Sequence[Callable],
@@ -89,12 +123,7 @@ def check_steps(
 
     def at(t):
         parts = tuple(jnp.sign(span) * part for part in projected(rates, t, u, args))
-        h = functools.reduce(jnp.add, parts)
-        z = dt * h
-        size = jnp.maximum(jnp.max(jnp.sum(jnp.abs(z), axis=1)), 1)
-        grown = jnp.maximum(size * log_radius(_exponential(z / size)), 0)
-        excess = log_radius(step(dt, [dt * part for part in parts])) - grown
-        round_off = 50 * jnp.finfo(h.dtype).eps * size
+        excess, round_off = _excess(step, dt, parts)
         # What is not finite is for others to find.
         unstable = jnp.maximum(length / dt, 1) * (excess - round_off) > np.log(_AMPLIFIED)
         return Verdict(~unstable, t, parts, excess)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxsurf as js
+from experiments import data
 
 from .helpers import check_derivative, count_compilations, jittered_sphere, relative_error
 
@@ -35,6 +36,27 @@ def test_coarse_points():
         cloud, source = js.sphere(n), jnp.array([n // 8])
         distance = js.geodesic_distance(cloud, source)
         assert relative_error(distance, exact_on_sphere(cloud, source)) < bound
+
+
+def test_normals_that_are_rough():
+    """Distances were 1.4e-2 too short: chords lean out of tangent planes that are tilted."""
+    cloud, source = js.sphere(2_500), jnp.array([0])
+    tilted = cloud.normals + 0.2 * np.random.default_rng(0).normal(size=cloud.points.shape)
+    tilted = tilted / jnp.linalg.norm(tilted, axis=1, keepdims=True)
+    distance = js.geodesic_distance(js.PointCloud(cloud.points, tilted), source)
+    assert relative_error(distance, exact_on_sphere(cloud, source)) < 5e-3
+
+
+def test_ways_that_are_shorter_than_straight_lines_are_told():
+    """Nothing was said where texture finer than the points makes distances a tenth too short."""
+    try:
+        cloud = data.armadillo(10_000)
+    except FileNotFoundError as error:
+        pytest.skip(str(error))
+    with pytest.warns(UserWarning, match=r"distances of \d+ points are shorter .* 0.9\d of it"):
+        distance = js.geodesic_distance(cloud, jnp.array([0]))
+    straight = jnp.linalg.norm(cloud.points - cloud.points[0], axis=1)
+    assert int(jnp.sum(distance < 0.95 * straight)) < 400
 
 
 def test_borders_and_random_points():

@@ -24,11 +24,13 @@ from ..stencils.gfdm import GFDM
 from ..stencils.method import AbstractMethod
 from ..stencils.stencil import Stencil
 from .krylov import BiCGStab, solve_system
-from .paths import around, path_lengths, source_indices
+from .paths import around, path_lengths, source_indices, tell_short
 from .precondition import multigrid
 
 # From this distance of their mean, in units of their root mean square, neighbours are one-sided.
 _ONE_SIDED = 0.45
+# A chord leans out of a tangent plane by 60 degrees at most.
+_LEANING = 4.0
 # Stencils spread heat over as much as a time of this times h² would: it falls the more slowly.
 # Found on circles, spheres, squares and random points, where v with it neither grows nor falls by
 # more than 0.05 of the powers.
@@ -60,7 +62,7 @@ def geodesic_distance(
     - The gradient is integrated as differences,
       $\sum_j (d_j - d_i) = \sum_j b_{ij} (x_j - x_i)\cdot(X_i + X_j) / 2$ over the neighbours j
       of i, which where two fronts meet and X jumps needs no divergence of it. The factors b make
-      up for chords that are shorter than arcs and directions that are not along them.
+      up for chords that are shorter than arcs and lean out of the tangent planes.
     - Next to the sources the distance is prescribed: that along the circular arc that fits both
       points and their normals. So a corner in the distance is not differentiated.
     - Where weights of the Laplacian have both signs, as along borders, it is a random walk's, which
@@ -141,7 +143,10 @@ def geodesic_distance(
         distance = jnp.where(cloud.active, distance, jax.lax.stop_gradient(distance))
     distance = refuse(distance, cold, _COLD, error=RuntimeError)
     text = f"distances have not been found to a relative tolerance of {rtol:.1g} (`rtol`)"
-    return refuse(distance, unsolved, text, error=RuntimeError)
+    distance = refuse(distance, unsolved, text, error=RuntimeError)
+    if is_concrete(distance):
+        tell_short(cloud, sources, np.asarray(distance))
+    return distance
 
 
 @sized_jit
@@ -289,8 +294,8 @@ def _integrate(place, differences, direction, value, inverse, rtol):
     def add_slot(total, slot):
         j, w = slot
         chord = x[j] - x
-        step = jnp.sum(chord * (direction + direction[j]), axis=1) / 2
-        return total - w * (_bent(chord, normals[j] - normals) * step - value[j]), None
+        step = _along(chord, direction, normals) + _along(chord, direction[j], normals[j])
+        return total - w * (_bent(chord, normals[j] - normals) * step / 2 - value[j]), None
 
     rhs, _ = jax.lax.scan(add_slot, jnp.zeros_like(value), (indices, share))
     preconditioner, table = inverse
@@ -299,15 +304,27 @@ def _integrate(place, differences, direction, value, inverse, rtol):
     return found.value + value, found.result != lx.RESULTS.successful
 
 
+def _along(chord, direction, normals):
+    """A chord's part along directions, as if it was turned into the tangent plane of one end.
+
+    Where normals are rough it leans out of that by as much, and would be too short.
+    """
+    square = jnp.sum(chord**2, axis=1)
+    square = jnp.where(square > 0, square, 1)
+    flat = square - jnp.sum(chord * normals, axis=1) ** 2
+    longer = jnp.sqrt(square / jnp.maximum(flat, square / _LEANING))
+    return longer * jnp.sum(chord * direction, axis=1)
+
+
 def _bent(chord, turn):
-    r"""Length of an arc over its chord times the cosine between the two.
+    r"""Length of an arc over its chord.
 
     A circle through two points turns by $2\theta$, $\sin\theta = a = (n_j - n_i)\cdot e / 2$ with e
-    along the chord: $\theta / (\sin\theta\cos\theta) = 1 + 2 a^2 / 3 + 8 a^4 / 15 + \dots$
+    along the chord: $\theta / \sin\theta = 1 + a^2 / 6 + 3 a^4 / 40 + \dots$
     """
     square = jnp.sum(chord**2, axis=1)
     a2 = jnp.sum(turn * chord, axis=1) ** 2 / (4 * jnp.where(square == 0, 1, square))
-    return 1 + a2 * (2 / 3 + a2 * (8 / 15))
+    return 1 + a2 * (1 / 6 + a2 * (3 / 40))
 
 
 def _neighbors(cloud, method) -> Neighbors:

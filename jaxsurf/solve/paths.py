@@ -9,11 +9,16 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
 from ..arguments import switched_off
 from ..cloud import PointCloud
 from ..compiling import power_of_two
-from ..failures import is_concrete, needs_values, raise_at
+from ..failures import is_concrete, needs_values, raise_at, warn
+
+# The share by which more than so large a share of distances falls short of straight lines. (Some do
+# where fronts meet next to a source.)
+_SHORT, _FEW = 0.05, 0.01
 
 
 def source_indices(sources, cloud: PointCloud) -> Int[np.ndarray, " m"]:
@@ -94,3 +99,18 @@ def around(indices, sources):
     owners[row, place] = owner
     full = np.minimum(np.arange(min(power_of_two(len(near)), len(indices))), len(near) - 1)
     return near[full].astype(np.int32), owners[full].astype(np.int32)
+
+
+def tell_short(cloud: PointCloud, sources, distance) -> None:
+    """Warn of many distances that are shorter than straight lines."""
+    points = np.asarray(cloud.points, float)
+    straight = cKDTree(points[sources]).query(points)[0]
+    far = cloud.host_active & (straight > 0)
+    share = np.where(far, distance / np.where(far, straight, 1), 1)
+    short, i = int(np.sum(share < 1 - _SHORT)), int(share.argmin())
+    if short > _FEW * np.sum(far):
+        warn(
+            f"the distances of {short} points are shorter than the straight line, that of point "
+            f"{i} is {share[i]:.2f} of it: directions on neighbouring points do not agree, as where "
+            "a surface has texture finer than its points. Use more of them there"
+        )

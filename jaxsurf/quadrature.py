@@ -64,11 +64,11 @@ class Cut(eqx.Module):
     degree: int = eqx.field(static=True)
     sides: int = eqx.field(static=True)
 
-    def __call__(self, around: Neighborhood, line: Float[Array, "d *p"] | None = None) -> Cells:
-        """Of a block; its line is the conormal where the surface ends, zero elsewhere."""
+    def __call__(self, around: Neighborhood, lines: Float[Array, "2 d *p"] | None = None) -> Cells:
+        """Of a block; its lines are the conormals where the surface ends, zero elsewhere."""
         plane, graph = Graph.of(around, self.degree)
         on = around.mask[0]
-        sides = Sides.of(plane, around.mask, self.sides, line)
+        sides = Sides.of(plane, around.mask, self.sides, lines)
         ways, room = jax.tree.map(kept, ways_of(jax.lax.stop_gradient(sides)))
         moments, reach = moments_over(sides, graph, ways)
         moments = stored(moments, plane.width[0] < 0)
@@ -101,8 +101,9 @@ def cells_of(cloud: PointCloud, neighbors: Neighbors, method: AbstractMethod, bo
     cut, size = cut_by(neighbors, method, cloud.dim), block(CELLS)
     neighbors, lines = neighbors.nearest, None
     if border is not None:
-        outward = jnp.zeros_like(cloud.points).at[border.points].set(border.conormals(cloud))
-        lines = in_blocks(outward.T, size)
+        outward = jnp.zeros((2, *cloud.points.shape), cloud.points.dtype)
+        outward = outward.at[:, border.points].set(border.edges(cloud))
+        lines = in_blocks(outward.swapaxes(1, 2), size)
     blocks = blocks_of(cloud, neighbors, np.arange(cloud.n, dtype=np.int32), size)
 
     def by(cut: Cut) -> Cells:

@@ -5,10 +5,13 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import matplotlib as mpl
+import matplotlib.path
 import numpy as np
 import pytest
 import scipy.sparse
 import scipy.sparse.linalg
+from scipy.spatial import cKDTree
 
 import jaxsurf as js
 from jaxsurf.boundary import check_border
@@ -756,6 +759,73 @@ def test_the_tip_of_a_sharp_corner_lies_on_the_border(degrees):
     step = np.linalg.norm(np.diff(np.array(points)[[*path, path[0]]], axis=0), axis=1)
     assert step.max() < 1.2
     assert set(path[border.corners]) == {0, n - 1 - round(2 * half * m), n - 1}
+
+
+def polygon(corners, h, seed=0) -> js.PointCloud:
+    """A flat polygon: even points on its sides, a lattice inside, in random order."""
+    corners = np.array(corners, float)
+    sides = []
+    for start, end in zip(corners, np.roll(corners, -1, axis=0)):
+        count = max(round(np.linalg.norm(end - start) / h), 2)
+        sides.append(start + (end - start) * np.linspace(0, 1, count, endpoint=False)[:, None])
+    border = np.concatenate(sides)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    inside = np.stack(np.meshgrid(*(np.arange(a, b, h) for a, b in zip(low, high))), -1)
+    inside = inside.reshape(-1, 2) + 0.05 * h
+    inside = inside[mpl.path.Path(corners).contains_points(inside)]
+    inside = inside[cKDTree(border).query(inside)[0] > 0.6 * h]
+    n = len(border) + len(inside)
+    order = np.random.default_rng(seed).permutation(n)
+    points = np.pad(np.concatenate([border, inside]), [(0, 0), (0, 1)])
+    normals = np.tile([0.0, 0.0, 1.0], (n, 1))
+    return js.PointCloud(points[order], normals, boundary=order < len(border))
+
+
+STAR = [
+    ((1 if i % 2 else 0.45) * np.cos(i * np.pi / 5), (1 if i % 2 else 0.45) * np.sin(i * np.pi / 5))
+    for i in range(10)
+]
+SHARP = {
+    "triangle of 27 degrees": [(0, 0), (2, 0), (0, 1)],
+    "20 degrees": [(0, 0), (2, 0.35), (2, -0.35)],
+    "star": STAR,
+    "L": [(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)],
+}
+
+
+@pytest.mark.parametrize("h", [0.1, 0.05])
+@pytest.mark.parametrize("name", SHARP)
+def test_sharp_corners_are_in_order(name, h):
+    """Both sides are nearer to each other than points of each: tips were cut off, in silence."""
+    cloud = polygon(SHARP[name], h)
+    border = js.find_border(cloud)
+    path = np.asarray(cloud.points)[np.asarray(border.points)]
+    assert np.linalg.norm(path - np.roll(path, 1, axis=0), axis=1).max() < 1.2 * h
+    assert int(border.corners.sum()) == len(SHARP[name])
+
+
+@pytest.mark.parametrize("slope", [0.8, 1.0, 1.5])
+@pytest.mark.parametrize("side", [11, 21])
+def test_a_sheared_lattice(slope, side):
+    """At a corner of 45 degrees the conormal led inwards, others were cut off; areas failed."""
+    flat = js.graph(lambda x, y: 0 * x, (side, side))
+    points = np.asarray(flat.points) @ np.array([[1, 0, 0], [slope, 1, 0], [0, 0, 1]])
+    cloud = js.PointCloud(points, flat.normals, boundary=flat.boundary)
+    surface = js.discretize(cloud, method=js.GFDM(degree=2))
+    assert int(surface.border.corners.sum()) == 4
+    away = jnp.sum(surface.border.conormals(cloud) * points[surface.border.points], axis=1)
+    assert float(away.min()) > 0.3
+    # Cells of corners are cut off on both sides: they were half of a lattice's, or more.
+    if slope <= 1:
+        np.testing.assert_allclose(surface.areas.sum(), 4.0, rtol=1e-13)
+
+
+def test_a_border_that_is_not_resolved_is_told():
+    """Two rims that are nearer to each other than points of each."""
+    flat = js.graph(lambda x, y: 0 * x, (21, 21))
+    points = np.asarray(flat.points) @ np.array([[1, 0, 0], [2.5, 1, 0], [0, 0, 1]])
+    with pytest.warns(UserWarning, match=r"border is not resolved: at \d+ .* first \d+"):
+        js.find_border(js.PointCloud(points, flat.normals, boundary=flat.boundary))
 
 
 def test_conormals_of_a_mesh():

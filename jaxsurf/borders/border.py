@@ -83,6 +83,20 @@ class Border(eqx.Module):
         return self.at(cloud, side, slot, cloud.points[self.points])[2]
 
     @sized_jit
+    def edges(self, cloud: PointCloud) -> Float[Array, "2 m d"]:
+        """Outward conormals of what bounds the surface at each point: both sides of a convex
+        corner, else one, and zero."""
+        conormals = self.conormals(cloud)
+        none = jnp.zeros_like(conormals)
+        if cloud.dim == 2:
+            return jnp.stack([conormals, none])
+        before, after = (self.side_conormals(cloud, side) for side in (0, 1))
+        turns = jnp.any(self.rows[0] != self.rows[1], axis=1)
+        turn = jnp.sum(jnp.cross(before, after) * cloud.normals[self.points], axis=1)
+        convex = (turns & (turn > 0))[:, None]
+        return jnp.stack([jnp.where(convex, before, conormals), jnp.where(convex, after, none)])
+
+    @sized_jit
     def at(self, cloud: PointCloud, side, slot, near: Float[Array, "p d"]):
         """Foot points on the border, and the geometry there.
 

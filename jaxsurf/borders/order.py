@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from ..arguments import instance
 from ..cloud import PointCloud
 from ..compiling import on_device
-from ..failures import is_concrete, needs_values, without_derivatives
+from ..failures import is_concrete, needs_values, warn, without_derivatives
 from ..shapes.meshes import TriangleMesh
 from ..sheets import distance_key
 from .border import Border, checked_border
@@ -23,6 +23,12 @@ _TURN, _TIMES, _SHARP = 0.3, 2.5, 1.0
 # Along a border, the second neighbour is off by at least this cosine from the first, and not
 # farther than so many spacings. Not those of a lattice: there the last bit would decide.
 _ASIDE, _FAR = 0.49, 4.03
+# And where there is none, by this: corners of 16 degrees and more.
+_TIP = 0.96
+# The outside of a border is off the surface, but for this cosine: ends of an open path may lean.
+_LEANING = 0.25
+# An end is beside another part so many spacings away.
+_BESIDE = 2.0
 
 
 def border_conormals(cloud: PointCloud, border: Border | None = None) -> Float[Array, "m d"]:
@@ -62,8 +68,8 @@ def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
     """The points marked in `cloud.boundary`, put in order along the border.
 
     Every border point is linked to its nearest one, and to the nearest one on the other side of
-    it; one that others pass over, as the tip of a sharp corner, is put between the two where the
-    way over it is least longer. Or the border edges of a mesh say how.
+    it; those that others pass over, as the tip of a sharp corner, are put between two where the
+    way over them is least longer. Or the border edges of a mesh say how.
 
     Args:
         cloud: n points with `boundary`; concrete.
@@ -76,6 +82,9 @@ def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
         TypeError: no cloud, no mesh.
         ValueError: traced arrays; no point marked; a marked point without a neighbour along the
             border (named by index); a mesh with another number of vertices, or without border.
+
+    Warns where what is found cannot be: its outside is where the surface is, or it ends beside
+    another part of it.
 
     Example:
         >>> border = js.find_border(js.graph(lambda x, y: 0 * x, (6, 6)))
@@ -102,11 +111,22 @@ def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
     if cloud.dim == 2:
         return _ends(points, np.flatnonzero(on), np.flatnonzero(marked))
     names = np.flatnonzero(marked)
-    paths = []
-    for path, closed in _paths(_links(points[names], names)):
-        if _leftness(cloud, names[path], inside[path], closed) < 0:
-            path = path[::-1]
+    paths, wrong = [], np.zeros(len(names), bool)
+    chains = _paths(_links(points[names], names))
+    for path, closed in chains:
+        left = _leftness(cloud, names[path], inside[path], closed)
+        if np.sum(left) < 0:
+            path, left = path[::-1], -left[::-1]
+        wrong[path] = left < -_LEANING * np.linalg.norm(inside[path], axis=1)
         paths.append((names[path], closed))
+    wrong[_cut_off(points[names], chains)] = True
+    if wrong.any():
+        warn(
+            f"the border is not resolved: at {wrong.sum()} of its points, the first "
+            f"{names[np.argmax(wrong)]}, what is found as its outside is where the surface is, or "
+            "it ends beside another part. Use more points there; a mesh tells the order, "
+            "js.find_border(cloud, mesh)"
+        )
     return _with_rows(cloud, paths)
 
 
@@ -147,7 +167,12 @@ def _links(points, names) -> list[list[int]]:
     cosine = np.einsum("nkd,nd->nk", d, first) / distance
     close_by = distance < _FAR * np.median(distance[:, 0])
     other = (cosine < _ASIDE) & close_by
-    second = np.where(other.any(axis=1), near[np.arange(len(near)), np.argmax(other, axis=1)], -1)
+    # At the tip of a sharp corner nothing is on the other side.
+    other = np.where(other.any(axis=1)[:, None], other, (cosine < _TIP) & close_by)
+    # Of those that are equally far, the one straight on.
+    far = np.where(other, distance_key(distance**2), np.iinfo(np.int64).max)
+    ahead = np.lexsort((near, np.round(cosine, 6), far), axis=1)[:, 0]
+    second = np.where(other.any(axis=1), near[np.arange(len(near)), ahead], -1)
     wanted = {(i, int(j)) for i, j in enumerate(near[:, 0])}
     wanted |= {(i, int(j)) for i, j in enumerate(second) if j >= 0}
     pairs = _not_past_tips({(min(p), max(p)) for p in wanted}, len(names))
@@ -161,12 +186,12 @@ def _links(points, names) -> list[list[int]]:
             links[i].append(j)
             links[j].append(i)
     for i in [i for i, linked in enumerate(links) if not linked]:
-        if not _insert(i, near[i][close_by[i]], points, links):
+        if not _insert(i, i, near[i][close_by[i]], points, links):
             raise ValueError(
                 f"border point {names[i]} has no neighbour along the border: mark all points "
                 "there, and no inner ones (of uneven points js.detect_boundary may name some)"
             )
-    return links
+    return _rejoined(points, links)
 
 
 def _not_past_tips(pairs: set[tuple[int, int]], m: int) -> set[tuple[int, int]]:
@@ -183,18 +208,46 @@ def _not_past_tips(pairs: set[tuple[int, int]], m: int) -> set[tuple[int, int]]:
     return pairs - past
 
 
-def _insert(i, near, points, links) -> bool:
-    """Take the way over point i where that is least longer: the tip of a sharp corner, say."""
-    ways = sorted({(min(a, b), max(a, b)) for a in near.tolist() for b in links[a]})
+def _insert(i, j, near, points, links) -> bool:
+    """Take the way over the chain from i to j, as a tip, where that is least longer.
+
+    Between two points that are linked, of which one is among those that are near.
+    """
+    ways = sorted({way for a in near.tolist() for b in links[a] for way in ((a, b), (b, a))})
     if not ways:
         return False
     a, b = np.transpose(ways)
     length = lambda p, q: np.linalg.norm(points[p] - points[q], axis=-1)
-    longer = length(a, i) + length(i, b) - length(a, b)
+    longer = length(a, i) + length(j, b) - length(a, b)
     a, b = ways[np.argmin(distance_key(np.maximum(longer, 0)))]
-    links[a][links[a].index(b)] = links[b][links[b].index(a)] = i
-    links[i] += [a, b]
+    links[a][links[a].index(b)], links[b][links[b].index(a)] = i, j
+    links[i].append(a)
+    links[j].append(b)
     return True
+
+
+def _rejoined(points, links) -> list[list[int]]:
+    """With tips that are cut off, where both sides of a corner are nearer than points of each."""
+    chains = _paths(links)
+    label = np.zeros(len(points), int)
+    for i, (path, _) in enumerate(chains):
+        label[path] = i
+    beside = _beside(
+        points, [int(path[k]) for path, closed in chains if not closed for k in (0, -1)]
+    )
+    for path, closed in chains:
+        if not closed and all((label[beside[path[k]]] != label[path[0]]).any() for k in (0, -1)):
+            near = np.concatenate([beside[path[k]] for k in (0, -1)])
+            _insert(path[0], path[-1], near[label[near] != label[path[0]]], points, links)
+    return links
+
+
+def _beside(points, ends) -> dict[int, np.ndarray]:
+    """All points beside some."""
+    tree = cKDTree(points)
+    reach = _BESIDE * np.median(tree.query(points, 2)[0][:, 1])
+    near = tree.query_ball_point(points[ends], reach) if ends else []
+    return {end: np.array(others) for end, others in zip(ends, near)}
 
 
 def _paths(links: list[list[int]]) -> list[tuple[np.ndarray, bool]]:
@@ -218,11 +271,21 @@ def _paths(links: list[list[int]]) -> list[tuple[np.ndarray, bool]]:
     return paths
 
 
-def _leftness(cloud, path, inside, closed) -> float:
-    """Positive if the surface lies on the left of a path, seen from where the normals point."""
+def _cut_off(points, chains) -> list[int]:
+    """Ends of open chains that are beside another chain."""
+    ends = {int(path[k]): path for path, closed in chains if not closed for k in (0, -1)}
+    beside = _beside(points, list(ends))
+    return [end for end, path in ends.items() if not np.isin(beside[end], path).all()]
+
+
+def _leftness(cloud, path, inside, closed) -> np.ndarray:
+    """How far the surface lies on the left of each point of a path, as normals see it."""
     points, normals = np.asarray(cloud.points, float)[path], np.asarray(cloud.normals)[path]
-    ahead = np.roll(points, -1, axis=0) - points if closed else np.gradient(points, axis=0)
-    return float(np.sum(np.cross(normals, ahead) * inside))
+    on_either_side = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
+    ahead = on_either_side if closed else np.gradient(points, axis=0)
+    left = np.cross(normals, ahead)
+    size = np.linalg.norm(left, axis=1)
+    return np.sum(left * inside, axis=1) / np.where(size > 0, size, 1)
 
 
 def _with_rows(cloud, paths) -> Border:

@@ -51,14 +51,15 @@ class Sides(eqx.Module):
 
     @classmethod
     def of(cls, plane: TangentPlane, mask, cells: int, outward) -> Sides:
-        """Those of the first neighbours, and at the end of a surface the line of its border."""
+        """Those of the first neighbours, and at the end of a surface the lines of its border."""
         flat, high, on = plane.points[:, 1:cells], plane.heights[1:cells], mask[1:cells]
         offset = (jnp.sum(flat**2, axis=0) + high**2) / 2
         if outward is not None:
-            line = jnp.sum(plane.tangents * outward, axis=1)[:, None]
-            flat = jnp.concatenate([flat, line], axis=1)
-            high, offset = (jnp.pad(a, [(0, 1)] + [(0, 0)] * (a.ndim - 1)) for a in (high, offset))
-            on = jnp.concatenate([on, jnp.any(line != 0, axis=0)])
+            lines = jnp.sum(plane.tangents[:, None] * outward, axis=2)
+            flat = jnp.concatenate([flat, lines], axis=1)
+            more = [(0, len(outward))] + [(0, 0)] * (high.ndim - 1)
+            high, offset = jnp.pad(high, more), jnp.pad(offset, more)
+            on = jnp.concatenate([on, jnp.any(lines != 0, axis=0)])
         return cls(flat, high, jnp.where(on, offset, 0), on)
 
     def chosen(self, *places: Int[Array, "s p"]) -> list[Sequence[Float[Array, "s p"]]]:

@@ -111,6 +111,6 @@ def tell_short(cloud: PointCloud, sources, distance) -> None:
     if short > _FEW * np.sum(far):
         warn(
             f"the distances of {short} points are shorter than the straight line, that of point "
-            f"{i} is {share[i]:.2f} of it: directions on neighbouring points do not agree, as where "
-            "a surface has texture finer than its points. Use more of them there"
+            f"{i} is {share[i]:.2f} of it: directions on neighbouring points do not agree, as "
+            "where a surface has texture finer than its points. Use more of them there"
         )

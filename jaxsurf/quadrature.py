@@ -27,7 +27,7 @@ from .fits.graph import Graph
 from .fits.moments import blockwise, in_blocks, moment_solve
 from .fits.monomials import polynomial_count
 from .fits.plane import Neighborhood
-from .fits.polygon import Sides, moments_over, ways_of
+from .fits.polygon import Lines, Sides, moments_over, ways_of
 from .machine import CELLS, block
 from .neighbors import Neighbors
 from .stencils.method import AbstractMethod, with_center
@@ -64,8 +64,8 @@ class Cut(eqx.Module):
     degree: int = eqx.field(static=True)
     sides: int = eqx.field(static=True)
 
-    def __call__(self, around: Neighborhood, lines: Float[Array, "2 d *p"] | None = None) -> Cells:
-        """Of a block; its lines are the conormals where the surface ends, zero elsewhere."""
+    def __call__(self, around: Neighborhood, lines: Lines | None = None) -> Cells:
+        """Of a block, and the lines where the surface ends."""
         plane, graph = Graph.of(around, self.degree)
         on = around.mask[0]
         sides = Sides.of(plane, around.mask, self.sides, lines)
@@ -99,11 +99,9 @@ def cut_by(neighbors: Neighbors, method: AbstractMethod, dim: int) -> Cut:
 def cells_of(cloud: PointCloud, neighbors: Neighbors, method: AbstractMethod, border) -> Cells:
     """All cells; if the usual number of neighbours closes not all of them, by all neighbours."""
     cut, size = cut_by(neighbors, method, cloud.dim), block(CELLS)
-    neighbors, lines = neighbors.nearest, None
-    if border is not None:
-        outward = jnp.zeros((2, *cloud.points.shape), cloud.points.dtype)
-        outward = outward.at[:, border.points].set(border.edges(cloud))
-        lines = in_blocks(outward.swapaxes(1, 2), size)
+    neighbors = neighbors.nearest
+    lines = None if border is None else _lines(cloud, neighbors, border)
+    lines = jax.tree.map(lambda a: in_blocks(a, size), lines)
     blocks = blocks_of(cloud, neighbors, np.arange(cloud.n, dtype=np.int32), size)
 
     def by(cut: Cut) -> Cells:
@@ -113,6 +111,19 @@ def cells_of(cloud: PointCloud, neighbors: Neighbors, method: AbstractMethod, bo
     if is_concrete(cells.closed) and not np.all(cells.closed) and cut.sides < neighbors.k:
         return by(Cut(cut.degree, neighbors.k))
     return cells
+
+
+@sized_jit
+def _lines(cloud: PointCloud, neighbors: Neighbors, border) -> Lines:
+    """Of the first border point in the list of each point."""
+    x = cloud.points
+    edges = jnp.zeros((2, *x.shape), x.dtype).at[:, border.points].set(border.edges(cloud))
+    marked = jnp.zeros(cloud.n, bool).at[border.points].set(True)
+    seen = marked[neighbors.indices] & neighbors.mask
+    first = jnp.take_along_axis(neighbors.indices, jnp.argmax(seen, axis=1)[:, None], axis=1)[:, 0]
+    outward = jnp.where(jnp.any(seen, axis=1)[:, None], edges[:, first], 0)
+    along = lambda a: jnp.sum(outward * a, axis=2)
+    return Lines(outward.swapaxes(1, 2), along(cloud.normals), along(x[first] - x))
 
 
 def cells_in_rows(blocks: Cells, count: int) -> Cells:

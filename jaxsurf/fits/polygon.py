@@ -34,6 +34,20 @@ _LOST = 1e3
 _SIDES = 16
 
 
+class Lines(eqx.Module):
+    """Where a surface ends: those at the nearest point of its border.
+
+    Args:
+        outward: conormals there, zero for none; at a convex corner there are two.
+        rise: of these along the normal of a cell's point.
+        away: how far they are from that point, negative behind it.
+    """
+
+    outward: Float[Array, "r d *p"]
+    rise: Float[Array, "r *p"]
+    away: Float[Array, "r *p"]
+
+
 class Sides(eqx.Module):
     r"""What bounds a cell: the planes $x\cdot d = b$ half way to its neighbours.
 
@@ -50,16 +64,22 @@ class Sides(eqx.Module):
     on: Bool[Array, "r *p"]
 
     @classmethod
-    def of(cls, plane: TangentPlane, mask, cells: int, outward) -> Sides:
-        """Those of the first neighbours, and at the end of a surface the lines of its border."""
+    def of(cls, plane: TangentPlane, mask, cells: int, lines=None) -> Sides:
+        """Those of the first neighbours, and at the end of a surface the lines of its border.
+
+        Of a line at a distance, as of the image across it, unless others are nearer.
+        """
         flat, high, on = plane.points[:, 1:cells], plane.heights[1:cells], mask[1:cells]
         offset = (jnp.sum(flat**2, axis=0) + high**2) / 2
-        if outward is not None:
-            lines = jnp.sum(plane.tangents[:, None] * outward, axis=2)
-            flat = jnp.concatenate([flat, lines], axis=1)
-            more = [(0, len(outward))] + [(0, 0)] * (high.ndim - 1)
-            high, offset = jnp.pad(high, more), jnp.pad(offset, more)
-            on = jnp.concatenate([on, jnp.any(lines != 0, axis=0)])
+        if lines is not None:
+            away = lines.away / plane.width
+            size = jnp.where(away > 0, 2 * away, 1)
+            along = size * jnp.sum(plane.tangents[:, None] * lines.outward, axis=2)
+            reach = jnp.max(jnp.where(on, jnp.sum(flat**2, axis=0), 0), axis=0)
+            near = jnp.any(lines.outward != 0, axis=1) & (away >= 0) & (4 * away**2 <= reach)
+            flat, on = jnp.concatenate([flat, along], axis=1), jnp.concatenate([on, near])
+            high = jnp.concatenate([high, jnp.where(away > 0, size * lines.rise, 0)])
+            offset = jnp.concatenate([offset, jnp.where(away > 0, 2 * away**2, 0)])
         return cls(flat, high, jnp.where(on, offset, 0), on)
 
     def chosen(self, *places: Int[Array, "s p"]) -> list[Sequence[Float[Array, "s p"]]]:

@@ -67,7 +67,8 @@ class AdvectionDiffusionReaction(AbstractEvolution):
             cannot resolve: `hyperviscosity` or `upwind_viscosity`.
         closure: from `eliminate` or `with_ghosts`; None for closed surfaces.
         mass: weights m, `(n,)`. If given, transport is corrected by the smallest change that
-            keeps $\sum_i m_i u_i$: a shift of the rate by its mean. Conserves to round-off.
+            keeps $\sum_i m_i u_i$: a shift of the rate by its mean. Conserves to round-off, where a
+            surface moves to the accuracy of the operators.
 
     Accuracy: that of the operators; the correction of the mass is of the size of their error. In
     float32 values are within 1e-3 and derivatives within 1e-2 at the default tolerances

@@ -6,6 +6,9 @@ over that plane, fitted to the neighbours, the moments of the cell are found by 
 A function is integrated over a cell as its local polynomial is: from these moments come weights of
 all neighbours, exactly as those of a derivative come from its values on monomials
 (`fits/moments.py`). Their sums over all cells integrate over the surface.
+
+At a border cells end at straight lines along it, two at a convex corner: those at the first border
+point in the list of each point.
 """
 
 from __future__ import annotations

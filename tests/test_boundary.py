@@ -1,6 +1,7 @@
 """Boundary conditions: exactness, order, stability, gradients, and what is refused."""
 
 import functools
+import warnings
 
 import equinox as eqx
 import jax
@@ -761,13 +762,17 @@ def test_the_tip_of_a_sharp_corner_lies_on_the_border(degrees):
     assert set(path[border.corners]) == {0, n - 1 - round(2 * half * m), n - 1}
 
 
-def polygon(corners, h, seed=0) -> js.PointCloud:
-    """A flat polygon: even points on its sides, a lattice inside, in random order."""
-    corners = np.array(corners, float)
+def polygon(corners, h, seed=0, uneven=0.0) -> js.PointCloud:
+    """A flat polygon: points on its sides, a lattice inside, in random order.
+
+    Those on sides are even, or moved along them by up to a share of h.
+    """
+    corners, rng = np.array(corners, float), np.random.default_rng(seed)
     sides = []
     for start, end in zip(corners, np.roll(corners, -1, axis=0)):
         count = max(round(np.linalg.norm(end - start) / h), 2)
-        sides.append(start + (end - start) * np.linspace(0, 1, count, endpoint=False)[:, None])
+        places = np.arange(count) + uneven * rng.uniform(-1, 1, count) * (np.arange(count) > 0)
+        sides.append(start + (end - start) * places[:, None] / count)
     border = np.concatenate(sides)
     low, high = corners.min(axis=0), corners.max(axis=0)
     inside = np.stack(np.meshgrid(*(np.arange(a, b, h) for a, b in zip(low, high))), -1)
@@ -775,7 +780,7 @@ def polygon(corners, h, seed=0) -> js.PointCloud:
     inside = inside[mpl.path.Path(corners).contains_points(inside)]
     inside = inside[cKDTree(border).query(inside)[0] > 0.6 * h]
     n = len(border) + len(inside)
-    order = np.random.default_rng(seed).permutation(n)
+    order = rng.permutation(n)
     points = np.pad(np.concatenate([border, inside]), [(0, 0), (0, 1)])
     normals = np.tile([0.0, 0.0, 1.0], (n, 1))
     return js.PointCloud(points[order], normals, boundary=order < len(border))
@@ -802,6 +807,49 @@ def test_sharp_corners_are_in_order(name, h):
     path = np.asarray(cloud.points)[np.asarray(border.points)]
     assert np.linalg.norm(path - np.roll(path, 1, axis=0), axis=1).max() < 1.2 * h
     assert int(border.corners.sum()) == len(SHARP[name])
+
+
+@pytest.mark.parametrize("degrees", [20, 30, 40])
+def test_uneven_points_at_a_sharp_tip(degrees):
+    """Tips made chains of their own: at 20 and 30 degrees three to four of twelve, in silence."""
+    half = 2 * np.tan(np.radians(degrees / 2))
+    told, silent = 0, 0
+    for seed in range(12):
+        cloud = polygon([(0, 0), (2, -half), (2, half)], 0.1, seed, uneven=0.05)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            border = js.find_border(cloud)
+        path = np.asarray(cloud.points)[np.asarray(border.points)]
+        steps = np.linalg.norm(path - np.roll(path, 1, axis=0), axis=1)
+        good = steps.max() < 0.15 and int(border.corners.sum()) == 3
+        told += not good and bool(caught)
+        silent += not good and not caught
+    assert silent <= (degrees == 20)
+    assert told <= {20: 8, 30: 4, 40: 0}[degrees]
+
+
+@pytest.mark.parametrize("hole", ["triangle", "square"])
+def test_borders_around_reentrant_corners_are_no_warning(hole):
+    """The points around such a corner are on all sides of it."""
+    sides = {"triangle": 3, "square": 4}[hole]
+    angles = 2 * np.pi * np.arange(sides) / sides + 0.3
+    corners = 1 + 0.45 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    for seed in range(4):
+        outer = polygon([(0, 0), (2, 0), (2, 2), (0, 2)], 0.1, seed)
+        inner = polygon(corners[::-1], 0.1, seed)
+        rim = np.asarray(inner.points)[np.asarray(inner.boundary)]
+        points, marked = np.asarray(outer.points), np.asarray(outer.boundary)
+        step = np.random.default_rng(seed).uniform(-0.015, 0.015, (len(points), 2))
+        points = points + np.pad(np.where(marked[:, None], 0, step), [(0, 0), (0, 1)])
+        away = ~mpl.path.Path(corners).contains_points(points[:, :2])
+        away &= cKDTree(rim).query(points)[0] > 0.07
+        points = np.concatenate([points[away], rim])
+        marked = np.concatenate([marked[away], np.ones(len(rim), bool)])
+        normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            border = js.find_border(js.PointCloud(points, normals, boundary=marked))
+        assert int(border.corners.sum()) == 4 + sides
 
 
 @pytest.mark.parametrize("slope", [0.8, 1.0, 1.5])

@@ -38,6 +38,22 @@ def test_coarse_points():
         assert relative_error(distance, exact_on_sphere(cloud, source)) < bound
 
 
+@pytest.mark.parametrize("every", [1, 3])
+def test_sources_everywhere(every):
+    """A bare error of linear algebra: where all points are sources or beside one, none is left."""
+    cloud = js.sphere(600)
+    sources = np.arange(0, 600, every)
+    distance = js.geodesic_distance(cloud, sources)
+    exact = exact_on_sphere(cloud, sources)
+    np.testing.assert_allclose(distance, exact, atol=1e-12)
+    slope = jax.grad(
+        lambda x: js.geodesic_distance(
+            js.PointCloud(x, cloud.normals), sources, neighbors=js.find_neighbors(cloud, k=20)
+        ).sum()
+    )(cloud.points)
+    assert bool(jnp.isfinite(slope).all())
+
+
 def test_normals_that_are_rough():
     """Distances were 1.4e-2 too short: chords lean out of tangent planes that are tilted."""
     cloud, source = js.sphere(2_500), jnp.array([0])

@@ -149,6 +149,65 @@ class Growing(dfx.AbstractStepSizeController):
         return jnp.asarray(True), t1, end, jnp.asarray(False), state, dfx.RESULTS.successful
 
 
+class Leapfrog(Midpoint):
+    """With the state before, and a first step of Euler's."""
+
+    def init(self, terms, t0, t1, y0, args):
+        return y0 - terms.vf_prod(t0, y0, args, terms.contr(t0, t1))
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        y1 = solver_state + 2 * terms.vf_prod(t0, y0, args, terms.contr(t0, t1))
+        return y1, None, dict(y0=y0, y1=y1), y0, dfx.RESULTS.successful
+
+
+class BackwardDifferences(Midpoint):
+    """Of second order, on vectors, by the Jacobian; its first step is Euler's, and too long."""
+
+    def init(self, terms, t0, t1, y0, args):
+        return y0, jnp.asarray(True)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        before, first = solver_state
+        rate = lambda y: terms.vf_prod(t1, y, args, terms.contr(t0, t1))
+        matrix = jnp.eye(y0.size) - 2 / 3 * jax.jacobian(rate)(y0)
+        later = jnp.linalg.solve(matrix, (4 * y0 - before) / 3)
+        y1 = jnp.where(first, y0 + rate(y0), later)
+        return y1, None, dict(y0=y0, y1=y1), (y0, jnp.asarray(False)), dfx.RESULTS.successful
+
+
+def test_solvers_with_a_memory_are_measured_behind_their_start():
+    """The first came back with 6e50, the second was refused."""
+    heat = js.AdvectionDiffusionReaction(RING, reaction=lambda t, u, args: 0.2 * u)
+    step = 0.25 * float(ANGLES[1]) ** 2
+    run = lambda solver, dt: js.integrate(heat, NOISE, t1=100 * dt, dt0=dt, solver=solver).ys[-1]
+    with pytest.raises(ValueError, match="Leapfrog is stable"):
+        run(Leapfrog(), 0.5 * step)
+    end = run(BackwardDifferences(), 5 * step)
+    decayed = np.mean(NOISE) * np.exp(0.2 * 500 * step)
+    assert abs(float(jnp.mean(end)) - decayed) < 0.1 * abs(decayed)
+
+
+class Adapting(Growing):
+    """By the error of each step: near the limit of stability, now and then beyond it."""
+
+    def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, state):
+        error = jnp.sqrt(jnp.mean((y_error / (self.longest * (1e-3 + jnp.abs(y1)))) ** 2))
+        keep = error < 1
+        factor = jnp.clip(0.9 * (error + 1e-10) ** (-1 / error_order), 0.2, 3.0)
+        step = (t1 - t0) * jnp.where(keep, factor, jnp.minimum(factor, 0.9))
+        start = jnp.where(keep, t1, t0)
+        return keep, start, start + step, jnp.asarray(False), state, dfx.RESULTS.successful
+
+
+def test_what_grows_by_itself_is_not_laid_to_steps_that_follow_errors():
+    """It was stopped when it had grown a hundredfold."""
+    growth = js.AdvectionDiffusionReaction(RING, reaction=lambda t, u, args: 3 * u)
+    how = dict(t1=3.0, solver=dfx.Heun(), controller=Adapting(1e-2))
+    end = js.integrate(growth, 1 + 0.1 * NOISE, **how).ys[-1]
+    mean = 1 + 0.1 * float(jnp.mean(NOISE))
+    np.testing.assert_allclose(float(jnp.mean(end)), mean * np.exp(9.0), rtol=2e-2)
+
+
 def test_a_solver_of_ones_own_is_looked_at():
     """Fields came back with values of 2e13; nothing bounds what a reaction may make of them."""
     heat = js.AdvectionDiffusionReaction(RING, reaction=lambda t, u, args: 0.2 * u)

@@ -25,10 +25,13 @@ _TURN, _TIMES, _SHARP = 0.3, 2.5, 1.0
 _ASIDE, _FAR = 0.49, 4.03
 # And where there is none, by this: corners of 16 degrees and more.
 _TIP = 0.96
-# The outside of a border is off the surface, but for this cosine: ends of an open path may lean.
-_LEANING = 0.25
+# Points around one of a border lie on its inside, or on either side of a corner; so many spacings
+# outside they do not.
+_LEANING = 0.35
 # An end is beside another part so many spacings away.
 _BESIDE = 2.0
+# Closed chains of so few points beside another are holes, or tips that are cut off.
+_SMALL = 6
 
 
 def border_conormals(cloud: PointCloud, border: Border | None = None) -> Float[Array, "m d"]:
@@ -112,12 +115,13 @@ def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
         return _ends(points, np.flatnonzero(on), np.flatnonzero(marked))
     names = np.flatnonzero(marked)
     paths, wrong = [], np.zeros(len(names), bool)
-    chains = _paths(_links(points[names], names))
+    spacing = _spacing(points[names])
+    chains = _paths(_links(points[names], names, inside))
     for path, closed in chains:
         left = _leftness(cloud, names[path], inside[path], closed)
         if np.sum(left) < 0:
             path, left = path[::-1], -left[::-1]
-        wrong[path] = left < -_LEANING * np.linalg.norm(inside[path], axis=1)
+        wrong[path] = left < -_LEANING * spacing
         paths.append((names[path], closed))
     wrong[_cut_off(points[names], chains)] = True
     if wrong.any():
@@ -152,7 +156,7 @@ def inward(points, on, border):
     return (points[on][near] - points[border][:, None]).mean(axis=1)
 
 
-def _links(points, names) -> list[list[int]]:
+def _links(points, names, inside) -> list[list[int]]:
     """For every border point the one or two that come next to it."""
     count = min(len(points), 12)
     if count < 2:
@@ -186,12 +190,12 @@ def _links(points, names) -> list[list[int]]:
             links[i].append(j)
             links[j].append(i)
     for i in [i for i, linked in enumerate(links) if not linked]:
-        if not _insert(i, i, near[i][close_by[i]], points, links):
+        if not _insert([(i, i)], near[i][close_by[i]], points, links):
             raise ValueError(
                 f"border point {names[i]} has no neighbour along the border: mark all points "
                 "there, and no inner ones (of uneven points js.detect_boundary may name some)"
             )
-    return _rejoined(points, links)
+    return _rejoined(points, links, inside)
 
 
 def _not_past_tips(pairs: set[tuple[int, int]], m: int) -> set[tuple[int, int]]:
@@ -208,46 +212,72 @@ def _not_past_tips(pairs: set[tuple[int, int]], m: int) -> set[tuple[int, int]]:
     return pairs - past
 
 
-def _insert(i, j, near, points, links) -> bool:
-    """Take the way over the chain from i to j, as a tip, where that is least longer.
+def _insert(ends, near, points, links) -> bool:
+    """Take the way over a chain, as a tip, where that is least longer.
 
     Between two points that are linked, of which one is among those that are near.
+
+    Args:
+        ends: of the chain, pairs `(i, j)`; of a closed one those of each link that may be broken.
     """
-    ways = sorted({way for a in near.tolist() for b in links[a] for way in ((a, b), (b, a))})
+    ways = sorted(
+        {(a, b, i, j) for c in near.tolist() for d in links[c] for a, b in ((c, d), (d, c))
+         for i, j in ends}
+    )  # fmt: skip
     if not ways:
         return False
-    a, b = np.transpose(ways)
+    a, b, i, j = np.transpose(ways)
     length = lambda p, q: np.linalg.norm(points[p] - points[q], axis=-1)
-    longer = length(a, i) + length(j, b) - length(a, b)
-    a, b = ways[np.argmin(distance_key(np.maximum(longer, 0)))]
+    longer = length(a, i) + length(j, b) - length(a, b) - length(i, j)
+    a, b, i, j = ways[np.argmin(distance_key(np.maximum(longer - longer.min(), 0)))]
+    if j in links[i]:
+        links[i].remove(j)
+        links[j].remove(i)
     links[a][links[a].index(b)], links[b][links[b].index(a)] = i, j
     links[i].append(a)
     links[j].append(b)
     return True
 
 
-def _rejoined(points, links) -> list[list[int]]:
+def _rejoined(points, links, inside) -> list[list[int]]:
     """With tips that are cut off, where both sides of a corner are nearer than points of each."""
-    chains = _paths(links)
-    label = np.zeros(len(points), int)
-    for i, (path, _) in enumerate(chains):
-        label[path] = i
-    beside = _beside(
-        points, [int(path[k]) for path, closed in chains if not closed for k in (0, -1)]
-    )
-    for path, closed in chains:
-        if not closed and all((label[beside[path[k]]] != label[path[0]]).any() for k in (0, -1)):
-            near = np.concatenate([beside[path[k]] for k in (0, -1)])
-            _insert(path[0], path[-1], near[label[near] != label[path[0]]], points, links)
+    while any(_put_back(points, links, inside, *chain) for chain in _paths(links)):
+        pass  # one chain less
     return links
 
 
-def _beside(points, ends) -> dict[int, np.ndarray]:
-    """All points beside some."""
-    tree = cKDTree(points)
-    reach = _BESIDE * np.median(tree.query(points, 2)[0][:, 1])
-    near = tree.query_ball_point(points[ends], reach) if ends else []
-    return {end: np.array(others) for end, others in zip(ends, near)}
+def _put_back(points, links, inside, path, closed) -> bool:
+    """Put a chain into another beside it, if it is a tip."""
+    near = _beside(points, path)
+    if not near.size:
+        return False
+    if closed:
+        if len(path) > _SMALL or _is_hole(points, inside, path):
+            return False
+        following = np.roll(path, -1)
+        ends = [*zip(path, following), *zip(following, path)]
+    else:
+        if not all(_beside(points, [path[k]], path).size for k in (0, -1)):
+            return False
+        ends = [(path[0], path[-1])]
+    return _insert([(int(i), int(j)) for i, j in ends], near, points, links)
+
+
+def _is_hole(points, inside, path) -> bool:
+    """Whether the surface is around a closed chain; around a tip it is on one side."""
+    away = points[path] - points[path].mean(axis=0)
+    size = np.linalg.norm(inside[path], axis=1) * np.linalg.norm(away, axis=1)
+    return bool(np.sum(inside[path] * away) > 0.5 * np.sum(size))
+
+
+def _spacing(points) -> float:
+    return float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
+
+
+def _beside(points, some, path=None) -> np.ndarray:
+    """All points beside some of a chain that are not on it."""
+    near = cKDTree(points).query_ball_point(points[some], _BESIDE * _spacing(points))
+    return np.setdiff1d(np.concatenate([*near]).astype(int), some if path is None else path)
 
 
 def _paths(links: list[list[int]]) -> list[tuple[np.ndarray, bool]]:
@@ -273,9 +303,8 @@ def _paths(links: list[list[int]]) -> list[tuple[np.ndarray, bool]]:
 
 def _cut_off(points, chains) -> list[int]:
     """Ends of open chains that are beside another chain."""
-    ends = {int(path[k]): path for path, closed in chains if not closed for k in (0, -1)}
-    beside = _beside(points, list(ends))
-    return [end for end, path in ends.items() if not np.isin(beside[end], path).all()]
+    ends = [(path, path[k]) for path, closed in chains if not closed for k in (0, -1)]
+    return [int(end) for path, end in ends if _beside(points, [end], path).size]
 
 
 def _leftness(cloud, path, inside, closed) -> np.ndarray:

@@ -25,7 +25,7 @@ from ..stencils.method import AbstractMethod
 from ..stencils.stencil import Stencil
 from .krylov import BiCGStab, solve_system
 from .paths import around, path_lengths, source_indices, tell_short
-from .precondition import multigrid
+from .precondition import jacobi, multigrid
 
 # From this distance of their mean, in units of their root mean square, neighbours are one-sided.
 _ONE_SIDED = 0.45
@@ -281,7 +281,9 @@ def _differences(indices, share, fixed, table=None) -> Stencil:
 def _preconditioner(indices, share, fixed, differentiated: bool):
     """Of the differences, and the table of their transpose where it is needed."""
     operator = _differences(np.ascontiguousarray(indices.T), share, fixed)
-    return jax.device_put(multigrid(operator)), operator.prepared.table if differentiated else None
+    # Hierarchies need unknowns.
+    inverse = jacobi(operator) if fixed.all() else multigrid(operator)
+    return jax.device_put(inverse), operator.prepared.table if differentiated else None
 
 
 def _integrate(place, differences, direction, value, inverse, rtol):

@@ -38,6 +38,10 @@ class AbstractAmplification(eqx.Module):
             As large as a part; of methods that keep several values, as large as all of them.
         """
 
+    def growth(self, dt, parts: Sequence) -> Any:
+        """Logarithm of what the mode that grows most is multiplied by."""
+        return log_radius(self(dt, parts))
+
 
 class Tableau(AbstractAmplification):
     """An explicit Runge–Kutta method.
@@ -149,33 +153,52 @@ class Halved(AbstractAmplification):
         return half @ half
 
 
+# Steps of a solver that is not known, half of which are its start.
+_MEASURED = 16
+
+
 class Measured(AbstractAmplification):
-    """A solver of one's own: its first step."""
+    """A solver of one's own: its first step; in the end it grows as from the middle of some on."""
 
     solver: dfx.AbstractSolver
 
     def __call__(self, dt, parts):
-        found = _first_step(self.solver, *jax.tree.map(jnp.asarray, (dt, list(parts))))
-        return np.asarray(found) if isinstance(parts[0], np.ndarray) else found
+        return _steps(self.solver, *jax.tree.map(jnp.asarray, (dt, list(parts))))[0]
+
+    def growth(self, dt, parts):
+        first, *later = _steps(self.solver, *jax.tree.map(jnp.asarray, (dt, list(parts))))
+        half, end = map(log_radius, later)
+        found = jnp.where(jnp.isfinite(end), (end - half) / (_MEASURED // 2), log_radius(first))
+        return float(found) if isinstance(parts[0], np.ndarray) else found
 
 
 @eqx.filter_jit
-def _first_step(solver, dt, parts):
+def _steps(solver, dt, parts):
+    """What one, half and all of these steps make of any state, which is a vector."""
     term_of = lambda z: dfx.ODETerm(lambda t, y, args: z @ y / dt)
     term = term_of(*parts) if len(parts) == 1 else dfx.MultiTerm(*map(term_of, parts))
-    start, times = _one(parts[0]), (jnp.zeros_like(dt), dt)
-    state = solver.init(term, *times, start, None)
-    return solver.step(term, *times, start, None, state, jnp.asarray(False))[0]
+
+    def made(y):
+        def step(carry, i):
+            t0, t1 = i * dt, (i + 1) * dt
+            y, _, _, state, _ = solver.step(term, t0, t1, *carry[:1], None, carry[1], False)
+            return (y, state), y
+
+        start = y, solver.init(term, jnp.zeros_like(dt), dt, y, None)
+        ys = jax.lax.scan(step, start, jnp.arange(_MEASURED, dtype=dt.dtype))[1]
+        return ys[0], ys[_MEASURED // 2 - 1], ys[-1]
+
+    return jax.vmap(made, in_axes=1, out_axes=1)(_one(parts[0]))
 
 
 def _is_general(solver: dfx.AbstractSolver, parts: int) -> bool:
     """Whether a solver takes a step of any matrices; one that knows its problem may not."""
-    z = jnp.zeros((2, 2))
+    z = jnp.zeros((3, 3))
     try:
-        jax.eval_shape(_first_step, solver, z[0, 0], [z] * parts)
+        found = jax.eval_shape(_steps, solver, z[0, 0], [z] * parts)
     except Exception:  # whatever somebody else's step runs into
         return False
-    return True
+    return all(step.shape == z.shape for step in found)
 
 
 def amplification_of(solver: dfx.AbstractSolver, parts: int = 1) -> AbstractAmplification | None:
@@ -222,6 +245,8 @@ def amplification_of(solver: dfx.AbstractSolver, parts: int = 1) -> AbstractAmpl
 def log_radius(matrix: Float[AnyArray, "m m"]) -> Any:
     """Logarithm of the spectral radius; in JAX by squaring over and over."""
     if isinstance(matrix, np.ndarray):
+        if not np.isfinite(matrix).all():
+            return np.inf
         with np.errstate(divide="ignore"):
             return np.log(np.abs(np.linalg.eigvals(matrix)).max())
     count = 30

@@ -41,19 +41,20 @@ class _Seen(NamedTuple):
 
     Args:
         state: of the controller.
-        size: the root mean square at the start, of the first state that is not zero.
-        excess: logarithm of how much they have amplified a mode beyond what the equation does.
+        size: the root mean square at the start, of the first state that is not zero, times what the
+            equation may have made of it since.
+        excess: logarithm of how much steps have amplified a mode beyond that.
     """
 
     state: Any
     size: Float[Array, ""]
     excess: Float[Array, ""]
 
-    def after(self, state, keep, y, excess) -> _Seen:
+    def after(self, state, keep, y, dt, watch: Watch) -> _Seen:
         """A step."""
-        first = keep & (self.size == 0)
-        size = jnp.where(first, root_mean_square(y), self.size)
-        return _Seen(state, size, self.excess + jnp.where(keep, excess, 0))
+        excess, grown = (jnp.where(keep, a, 0) for a in watch.of(dt))
+        size = jnp.where(keep & (self.size == 0), root_mean_square(y), self.size * jnp.exp(grown))
+        return _Seen(state, size, self.excess + excess)
 
     def accuses(self, y: PyTree[Array]) -> Bool[Array, ""]:
         """True if the state has grown much, and not beyond what the steps may have made of it."""
@@ -92,7 +93,7 @@ class Guarded(dfx.AbstractStepSizeController):
         )
         stop = keep & self.guard.stops(y1_candidate) | self.guard.refused
         if watch is not None:
-            new_state = seen.after(new_state, keep, y1_candidate, watch.excess(t1 - t0))
+            new_state = seen.after(new_state, keep, y1_candidate, t1 - t0, watch)
             stop = stop | keep & new_state.accuses(y1_candidate)
         result = dfx.RESULTS.where(stop, dfx.RESULTS.nonlinear_divergence, result)
         return keep & ~stop, jnp.where(stop, t0, start), end, jump, new_state, result

@@ -112,14 +112,15 @@ def integrate(
             given length that are explicit, in part or whole, beyond the limit of stability (with
             step, limit and spectral radius; of a rate that depends on time at six times, and at 128
             where the state has grown a hundredfold after all; of a solver of one's own as its first
-            step tells); diffusion backwards in time; a border about which nothing is said;
+            16 steps tell); diffusion backwards in time; a border about which nothing is said;
             tolerances out of range; times or steps that are lost in the precision of the state; a
             linear part of a problem of one's own that is not linear; a checkpoint that is of
             another run or damaged.
         IntegrationError: the end was not reached: the solution diverges (or grows a hundredfold
-            where the equation lets none grow, or where steps whose length a controller of one's own
-            chooses amplify a mode as much), the tolerance cannot be met, a linear system does not
-            converge. Holds the last good state. (Under `jit` an error of the run time.)
+            where the equation lets none grow, or has it grow less and steps whose length a
+            controller of one's own chooses amplify a mode as much), the tolerance cannot be met, a
+            linear system does not converge. Holds the last good state. (Under `jit` an error of the
+            run time.)
 
     Example:
         >>> cloud = js.sphere(500)

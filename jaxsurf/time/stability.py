@@ -48,19 +48,31 @@ class Verdict(eqx.Module):
     excess: Array
 
     def longest(self, step: AbstractAmplification, dt: float, span: float) -> tuple[float, float]:
-        """The longest stable step up to dt, and the spectral radius of the first part (host)."""
+        """The longest stable step up to dt, and the spectral radius of the first part (host).
+
+        Of steps in which the equation itself makes at most e of a mode.
+        """
         parts = [np.asarray(part, float) for part in self.projected]
         exact = np.linalg.eigvals(sum(parts)).real.max()
         radius = float(np.exp(log_radius(parts[0])))
-        for shorter in dt * np.geomspace(1, 1e-8, 1000):
-            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                found = step(shorter, [shorter * part for part in parts])
-                if not np.isfinite(found).all():
-                    continue
-                growth = log_radius(found) - max(shorter * exact, 0)
-            if growth * max(span / shorter, 1) <= np.log(_AMPLIFIED):
-                return float(shorter), radius
-        return 0.0, radius
+
+        def stable(shorter) -> bool:
+            with np.errstate(all="ignore"):
+                growth = step.growth(shorter, [shorter * part for part in parts])
+            beyond = growth - max(shorter * exact, 0)
+            return bool(beyond * max(span / shorter, 1) <= np.log(_AMPLIFIED))
+
+        dt = min(dt, 1 / exact) if exact > 0 else dt
+        found, longer = 0.0, dt
+        for ratio in np.geomspace(1, 1e-8, 60):  # then between the last two
+            if stable(dt * ratio):
+                found = dt * ratio
+                break
+            longer = dt * ratio
+        for between in np.geomspace(longer, found, 25)[1:-1] if 0 < found < dt else ():
+            if stable(between):
+                return float(between), radius
+        return float(found), radius
 
 
 class Watch(eqx.Module):
@@ -82,19 +94,20 @@ class Watch(eqx.Module):
         places = jnp.asarray(_PLACES if changes else _PLACES[:1], t0.dtype)
         return cls(constant(step), jax.lax.map(at, t0 + span * places))
 
-    def excess(self, dt) -> Array:
-        """Logarithm of the amplification of the worst mode in a step beyond what it should be."""
-        beyond = lambda parts: jnp.subtract(*_excess(self.step, jnp.abs(dt), parts))
-        return jnp.maximum(jnp.max(jax.lax.map(beyond, self.projected)), 0)
+    def of(self, dt) -> tuple[Array, Array]:
+        """Logarithms of what a step may make of a mode, at worst: beyond the equation, and that."""
+        found = jax.lax.map(lambda parts: _excess(self.step, jnp.abs(dt), parts), self.projected)
+        excess, round_off, grown = found
+        return jnp.maximum(jnp.max(excess - round_off), 0), jnp.max(grown)
 
 
-def _excess(step: AbstractAmplification, dt, parts) -> tuple[Array, Array]:
-    """Logarithm of the amplification of a mode beyond what it should be, and its round-off."""
+def _excess(step: AbstractAmplification, dt, parts) -> tuple[Array, Array, Array]:
+    """Logarithm of what a step makes of a mode beyond the equation, its round-off, and of that."""
     z = dt * functools.reduce(jnp.add, parts)
     size = jnp.maximum(jnp.max(jnp.sum(jnp.abs(z), axis=1)), 1)
     grown = jnp.maximum(size * log_radius(_exponential(z / size)), 0)
-    excess = log_radius(step(dt, [dt * part for part in parts])) - grown
-    return excess, 50 * jnp.finfo(z.dtype).eps * size
+    excess = step.growth(dt, [dt * part for part in parts]) - grown
+    return excess, 50 * jnp.finfo(z.dtype).eps * size, grown
 
 
 def check_steps(
@@ -123,7 +136,7 @@ def check_steps(
 
     def at(t):
         parts = tuple(jnp.sign(span) * part for part in projected(rates, t, u, args))
-        excess, round_off = _excess(step, dt, parts)
+        excess, round_off, _ = _excess(step, dt, parts)
         # What is not finite is for others to find.
         unstable = jnp.maximum(length / dt, 1) * (excess - round_off) > np.log(_AMPLIFIED)
         return Verdict(~unstable, t, parts, excess)

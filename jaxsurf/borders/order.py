@@ -115,15 +115,16 @@ def find_border(cloud: PointCloud, mesh: TriangleMesh | None = None) -> Border:
         return _ends(points, np.flatnonzero(on), np.flatnonzero(marked))
     names = np.flatnonzero(marked)
     paths, wrong = [], np.zeros(len(names), bool)
-    spacing = _spacing(points[names])
-    chains = _paths(_links(points[names], names, inside))
+    links = _links(points[names], names)
+    beside, spacing = _beside(points[names])
+    chains = _paths(_rejoined(points[names], links, inside, beside))
     for path, closed in chains:
         left = _leftness(cloud, names[path], inside[path], closed)
         if np.sum(left) < 0:
             path, left = path[::-1], -left[::-1]
         wrong[path] = left < -_LEANING * spacing
         paths.append((names[path], closed))
-    wrong[_cut_off(points[names], chains)] = True
+    wrong[_cut_off(chains, beside)] = True
     if wrong.any():
         warn(
             f"the border is not resolved: at {wrong.sum()} of its points, the first "
@@ -156,7 +157,7 @@ def inward(points, on, border):
     return (points[on][near] - points[border][:, None]).mean(axis=1)
 
 
-def _links(points, names, inside) -> list[list[int]]:
+def _links(points, names) -> list[list[int]]:
     """For every border point the one or two that come next to it."""
     count = min(len(points), 12)
     if count < 2:
@@ -195,7 +196,7 @@ def _links(points, names, inside) -> list[list[int]]:
                 f"border point {names[i]} has no neighbour along the border: mark all points "
                 "there, and no inner ones (of uneven points js.detect_boundary may name some)"
             )
-    return _rejoined(points, links, inside)
+    return links
 
 
 def _not_past_tips(pairs: set[tuple[int, int]], m: int) -> set[tuple[int, int]]:
@@ -212,25 +213,28 @@ def _not_past_tips(pairs: set[tuple[int, int]], m: int) -> set[tuple[int, int]]:
     return pairs - past
 
 
-def _insert(ends, near, points, links) -> bool:
+def _insert(ends, near, points, links, *, breaks=False) -> bool:
     """Take the way over a chain, as a tip, where that is least longer.
 
     Between two points that are linked, of which one is among those that are near.
 
     Args:
-        ends: of the chain, pairs `(i, j)`; of a closed one those of each link that may be broken.
+        ends: of the chain, `(i, j)`, of which there is a choice.
+        breaks: the link between them.
     """
     ways = sorted(
-        {(a, b, i, j) for c in near.tolist() for d in links[c] for a, b in ((c, d), (d, c))
-         for i, j in ends}
-    )  # fmt: skip
+        (a, b, i, j)
+        for a, b in {pair for c in near.tolist() for d in links[c] for pair in ((c, d), (d, c))}
+        for i, j in ends
+    )
     if not ways:
         return False
     a, b, i, j = np.transpose(ways)
     length = lambda p, q: np.linalg.norm(points[p] - points[q], axis=-1)
-    longer = length(a, i) + length(j, b) - length(a, b) - length(i, j)
-    a, b, i, j = ways[np.argmin(distance_key(np.maximum(longer - longer.min(), 0)))]
-    if j in links[i]:
+    # Twice the link more, which is positive.
+    longer = length(a, i) + length(j, b) - length(a, b) - length(i, j) + 2 * length(i, j).max()
+    a, b, i, j = ways[np.argmin(distance_key(np.maximum(longer, 0)))]
+    if breaks:
         links[i].remove(j)
         links[j].remove(i)
     links[a][links[a].index(b)], links[b][links[b].index(a)] = i, j
@@ -239,28 +243,25 @@ def _insert(ends, near, points, links) -> bool:
     return True
 
 
-def _rejoined(points, links, inside) -> list[list[int]]:
+def _rejoined(points, links, inside, beside) -> list[list[int]]:
     """With tips that are cut off, where both sides of a corner are nearer than points of each."""
-    while any(_put_back(points, links, inside, *chain) for chain in _paths(links)):
+    while any(_put_back(points, links, inside, beside, *chain) for chain in _paths(links)):
         pass  # one chain less
     return links
 
 
-def _put_back(points, links, inside, path, closed) -> bool:
+def _put_back(points, links, inside, beside, path, closed: bool) -> bool:
     """Put a chain into another beside it, if it is a tip."""
-    near = _beside(points, path)
-    if not near.size:
-        return False
+    off = lambda some: np.setdiff1d(np.concatenate([beside[i] for i in some]), path)
+    near = off(path)
     if closed:
-        if len(path) > _SMALL or _is_hole(points, inside, path):
-            return False
+        tip = near.size > 0 and len(path) <= _SMALL and not _is_hole(points, inside, path)
         following = np.roll(path, -1)
-        ends = [*zip(path, following), *zip(following, path)]
+        ends = [*zip(path.tolist(), following.tolist()), *zip(following.tolist(), path.tolist())]
     else:
-        if not all(_beside(points, [path[k]], path).size for k in (0, -1)):
-            return False
-        ends = [(path[0], path[-1])]
-    return _insert([(int(i), int(j)) for i, j in ends], near, points, links)
+        tip = off(path[:1]).size > 0 and off(path[-1:]).size > 0
+        ends = [(int(path[0]), int(path[-1]))]
+    return tip and _insert(ends, near, points, links, breaks=closed)
 
 
 def _is_hole(points, inside, path) -> bool:
@@ -270,14 +271,12 @@ def _is_hole(points, inside, path) -> bool:
     return bool(np.sum(inside[path] * away) > 0.5 * np.sum(size))
 
 
-def _spacing(points) -> float:
-    return float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
-
-
-def _beside(points, some, path=None) -> np.ndarray:
-    """All points beside some of a chain that are not on it."""
-    near = cKDTree(points).query_ball_point(points[some], _BESIDE * _spacing(points))
-    return np.setdiff1d(np.concatenate([*near]).astype(int), some if path is None else path)
+def _beside(points) -> tuple[list[np.ndarray], float]:
+    """The points beside each, itself included, and the spacing."""
+    tree = cKDTree(points)
+    spacing = float(np.median(tree.query(points, 2)[0][:, 1]))
+    near = tree.query_ball_point(points, _BESIDE * spacing)
+    return [np.array(some, int) for some in near], spacing
 
 
 def _paths(links: list[list[int]]) -> list[tuple[np.ndarray, bool]]:
@@ -301,10 +300,10 @@ def _paths(links: list[list[int]]) -> list[tuple[np.ndarray, bool]]:
     return paths
 
 
-def _cut_off(points, chains) -> list[int]:
+def _cut_off(chains, beside) -> list[int]:
     """Ends of open chains that are beside another chain."""
-    ends = [(path, path[k]) for path, closed in chains if not closed for k in (0, -1)]
-    return [int(end) for path, end in ends if _beside(points, [end], path).size]
+    ends = [(path, int(path[k])) for path, closed in chains if not closed for k in (0, -1)]
+    return [end for path, end in ends if np.setdiff1d(beside[end], path).size]
 
 
 def _leftness(cloud, path, inside, closed) -> np.ndarray:

@@ -28,7 +28,7 @@ class Guard(eqx.Module):
 
     limit: Float[Array, ""]
     refused: Bool[Array, ""]
-    watch: Watch | None
+    watch: Watch | None = None
 
     def stops(self, y: PyTree[Array]) -> Bool[Array, ""]:
         """True if entries are not finite or too large together."""

@@ -5,8 +5,10 @@ import contextlib
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxsurf as js
+from jaxsurf.moving import follow
 
 METHODS = [
     js.DCPSE(order=2),
@@ -161,3 +163,23 @@ def ring(n=24):
     tangents = np.stack([-np.sin(angles), np.cos(angles)])
     slopes = np.array([0.0, -1.0, 1.0])[:, None, None] / (2 * h) * tangents
     return jnp.asarray(angles), laplacian, js.Stencil(near, jnp.asarray(slopes), (2,))
+
+
+def killed(run, monkeypatch, writes=1):
+    """What a run comes to that was killed after so many writes of its file, and went on there."""
+
+    class Killed(Exception):
+        pass
+
+    def write_and_die(*content):
+        written(*content)
+        done.append(True)
+        if len(done) == writes:
+            raise Killed
+
+    written, done = follow.written, []
+    monkeypatch.setattr(follow, "written", write_and_die)
+    with pytest.raises(Killed):
+        run("killed")
+    monkeypatch.undo()
+    return run("killed")

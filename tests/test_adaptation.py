@@ -6,10 +6,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 import jaxsurf as js
-from jaxsurf.moving import follow, wear
+from jaxsurf.moving import wear
 from jaxsurf.moving.holes import _sides, circumcenters, large_triangles
 
-from .helpers import count_compilations
+from .helpers import count_compilations, killed
 
 RNG = np.random.default_rng(5)
 METHOD = js.GFDM(degree=4)
@@ -218,19 +218,7 @@ def test_points_are_added_while_a_sphere_grows(tmp_path, monkeypatch):
     assert 300 + events["added"].sum() - events["merged"].sum() == whole.clouds[-1].n
     assert np.all(np.diff(events["t"]) > 0) and whole.history["n"][-1] == whole.clouds[-1].n
 
-    class Killed(Exception):
-        pass
-
-    def write_and_die(*content):
-        written(*content)
-        raise Killed
-
-    written = follow.written
-    monkeypatch.setattr(follow, "written", write_and_die)
-    with pytest.raises(Killed):
-        run("killed")
-    monkeypatch.undo()
-    again = run("killed")
+    again = killed(run, monkeypatch)
     np.testing.assert_array_equal(again.changes, whole.changes)
     for one, other in zip(again.clouds, whole.clouds, strict=True):
         np.testing.assert_array_equal(one.points, other.points)

@@ -8,9 +8,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 import jaxsurf as js
-from jaxsurf.moving import follow
 from jaxsurf.moving.contact import chambers, facing, turned_over, watched, without_other_parts
 from jaxsurf.moving.surgery import HermiteSurface, rejoined
+
+from .helpers import killed
 
 METHOD = js.GFDM(degree=2)
 RNG = np.random.default_rng(3)
@@ -21,24 +22,6 @@ def spheres(n, centers, radii):
     turned = (x, x[:, [1, 0, 2]])
     points = [c + r * y for c, r, y in zip(centers, radii, turned)]
     return js.PointCloud(np.concatenate(points), np.concatenate(turned))
-
-
-def killed(run, monkeypatch):
-    """What a run comes to that was killed when it first wrote its file, and went on from there."""
-
-    class Killed(Exception):
-        pass
-
-    def write_and_die(*content):
-        written(*content)
-        raise Killed
-
-    written = follow.written
-    monkeypatch.setattr(follow, "written", write_and_die)
-    with pytest.raises(Killed):
-        run("killed")
-    monkeypatch.undo()
-    return run("killed")
 
 
 def closed(surface):

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 import jaxsurf as js
-from jaxsurf.moving import follow
 from jaxsurf.moving.eversion import told_extinction
 from jaxsurf.moving.problem import Moving
 
-from .helpers import count_compilations
+from .helpers import count_compilations, killed
 
 CLOUD = js.sphere(200)
 SURFACE = js.discretize(CLOUD, method=js.GFDM(degree=2))
@@ -159,24 +158,12 @@ def test_a_run_that_was_killed_ends_in_the_same_bits(tmp_path, monkeypatch):
         given = dict(saveat=[0.0, 0.2, 0.7], args=rate, fields=(X, Y), checkpoint=checkpoint)
         return js.evolve(js.Motion(slanting), SURFACE, t1=1.0, **given)
 
-    class Killed(Exception):
-        pass
-
-    def write_and_die(path, *content):
-        written(path, *content)
-        writes.append(path)
-        if len(writes) == 2:
-            raise Killed
-
-    whole, written, writes = run("whole"), follow.written, []
+    whole = run("whole")
     assert whole.stats["renewals"] > 0 and whole.ts.tolist() == [0.0, 0.2, 0.7, 1.0]
     np.testing.assert_allclose(whole.clouds[-1].points[:, 0], X + 1.2 * Z, atol=1e-6)
-    monkeypatch.setattr(follow, "written", write_and_die)
-    with pytest.raises(Killed):
-        run("killed")
-    monkeypatch.undo()
     arrays = lambda run: jax.tree.leaves((run.ts, run.surfaces, run.fields))
-    for again in (run("killed"), run("whole")):  # from the middle, and from the end
+    # From the middle, and from the end.
+    for again in (killed(run, monkeypatch, writes=2), run("whole")):
         assert again.stats | {"solver": ""} == whole.stats | {"solver": ""}
         for one, other in zip(arrays(again), arrays(whole), strict=True):
             np.testing.assert_array_equal(one, other)

@@ -70,12 +70,14 @@ class Border(eqx.Module):
     @sized_jit
     def conormals(self, cloud: PointCloud) -> Float[Array, "m d"]:
         """Outward unit conormals; at a corner the mean direction of both sides."""
+        return _unit(jnp.sum(self._on_both_sides(cloud), axis=0))
+
+    def _on_both_sides(self, cloud: PointCloud) -> Float[Array, "2 m d"]:
+        """Those of both pieces, together: the geometry there is compiled once."""
         m = len(self.points)
-        # Both sides together: the geometry there is compiled once.
         side, slot = jnp.divmod(jnp.arange(2 * m), m)
-        both = self.at(cloud, side, slot, cloud.points[self.points[slot]])[2]
-        total = both[:m] + both[m:]
-        return total / jnp.linalg.norm(total, axis=1, keepdims=True)
+        found = self.at(cloud, side, slot, cloud.points[self.points[slot]])[2]
+        return found.reshape(2, m, -1)
 
     def side_conormals(self, cloud: PointCloud, side: int) -> Float[Array, "m d"]:
         """Outward unit conormals of the piece before (0) or after (1) each point."""
@@ -86,15 +88,14 @@ class Border(eqx.Module):
     def edges(self, cloud: PointCloud) -> Float[Array, "2 m d"]:
         """Outward conormals of what bounds the surface at each point: both sides of a convex
         corner, else one, and zero."""
-        conormals = self.conormals(cloud)
-        none = jnp.zeros_like(conormals)
+        before, after = self._on_both_sides(cloud)
+        mean, none = _unit(before + after), jnp.zeros_like(before)
         if cloud.dim == 2:
-            return jnp.stack([conormals, none])
-        before, after = (self.side_conormals(cloud, side) for side in (0, 1))
+            return jnp.stack([mean, none])
         turns = jnp.any(self.rows[0] != self.rows[1], axis=1)
         turn = jnp.sum(jnp.cross(before, after) * cloud.normals[self.points], axis=1)
         convex = (turns & (turn > 0))[:, None]
-        return jnp.stack([jnp.where(convex, before, conormals), jnp.where(convex, after, none)])
+        return jnp.stack([jnp.where(convex, before, mean), jnp.where(convex, after, none)])
 
     @sized_jit
     def at(self, cloud: PointCloud, side, slot, near: Float[Array, "p d"]):

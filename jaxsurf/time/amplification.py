@@ -180,8 +180,8 @@ def _steps(solver, dt, parts):
 
     def made(y):
         def step(carry, i):
-            t0, t1 = i * dt, (i + 1) * dt
-            y, _, _, state, _ = solver.step(term, t0, t1, *carry[:1], None, carry[1], False)
+            y, state = carry
+            y, _, _, state, _ = solver.step(term, i * dt, (i + 1) * dt, y, None, state, False)
             return (y, state), y
 
         start = y, solver.init(term, jnp.zeros_like(dt), dt, y, None)

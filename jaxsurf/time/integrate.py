@@ -247,10 +247,11 @@ def _unstable(name: str, run: Run, verdict: Verdict) -> str:
         ways += ["no dt0 (steps are then adapted)" if given else "a controller that adapts them"]
     ways += [f"js.{other}()" for other in ("RKC2", "IMEX") if other != name and not split]
     better = ", or ".join(ways) or "another solver"
+    better = better if better.startswith("js.") else better[0].upper() + better[1:]
     return (
         f"{step} is unstable{when}: {name} {stable}, the spectral radius of the {what} is "
         f"{radius:.3g}; {'longer' if limit else 'these'} steps multiply its fastest mode by "
-        f"{float(jnp.exp(verdict.excess)):.3g} each. {better[0].upper()}{better[1:]}"
+        f"{float(jnp.exp(verdict.excess)):.3g} each. {better}"
     )
 
 
@@ -281,7 +282,7 @@ def _reason(plan: Plan, run: Run, solution: dfx.Solution, t: float, state) -> st
     reason = next((text for code, text in why if solution.result == code), None)
     if reason is None:
         reason = f"a linear system was not solved ({dfx.RESULTS[solution.result]})"  # type: ignore[misc]
-    if run.amplification is not None and run.step is None:
+    if run.amplification is not None and run.is_watched:
         span = abs(float(run.t1 - run.t0))
         longest, radius = run.checked(span).longest(run.amplification, span, span)
         reason += (

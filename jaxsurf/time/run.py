@@ -131,9 +131,14 @@ class Run(eqx.Module):
         now = (self.t0, self.u0, self.args, dt, self.t1 - self.t0)
         return check_steps(self.amplification, self.rates, *now, self.changes, closely)
 
+    @property
+    def is_watched(self) -> bool:
+        """Whether steps can be unstable whose lengths are not known before they are taken."""
+        return self.amplification is not None and self.step is None
+
     def watched(self) -> Watch | None:
         """A watch on steps whose length a controller chooses that knows no errors."""
-        if self.amplification is None or self.step is not None:
+        if not self.is_watched:
             return None
         now = (self.t0, self.u0, self.args, self.t1 - self.t0)
         return Watch.over(self.amplification, self.rates, *now, self.changes)
@@ -142,8 +147,7 @@ class Run(eqx.Module):
     def rates(self) -> tuple:
         """The right-hand side, or its parts, with what is frozen for a step as at the start."""
         terms = self.terms
-        if has_phases(terms):
-            terms = frozen(terms, self.t0, self.u0)
+        terms = frozen(terms, self.t0, self.u0) if has_phases(terms) else terms
         parts = terms.terms if isinstance(terms, dfx.MultiTerm) else (terms,)
         return tuple(part.vf for part in parts)
 
@@ -155,8 +159,8 @@ class Run(eqx.Module):
         Args:
             states: of which the last is the end.
         """
-        known = self.amplification is None or self.step is None
-        if known or not self.changes or float(self.limit) < jnp.inf:
+        bounded = float(self.limit) < jnp.inf
+        if self.amplification is None or self.step is None or not self.changes or bounded:
             return None
         last = jax.tree.map(lambda leaf: leaf[-1], states)
         if not 0 < GROWN * root_mean_square(self.u0) < root_mean_square(last):

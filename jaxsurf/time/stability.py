@@ -90,7 +90,7 @@ class Watch(eqx.Module):
     def over(cls, step, rates, t0, u, args, span, changes: bool) -> Watch:
         """Of a run; see `check_steps`."""
         rates, t0, u, args, span = constant((rates, t0, u, args, span))
-        at = lambda t: tuple(jnp.sign(span) * part for part in projected(rates, t, u, args))
+        at = lambda t: _onward(rates, t, u, args, span)
         places = jnp.asarray(_PLACES if changes else _PLACES[:1], t0.dtype)
         return cls(constant(step), jax.lax.map(at, t0 + span * places))
 
@@ -135,7 +135,7 @@ def check_steps(
     dt, length = jnp.abs(dt), jnp.abs(span)
 
     def at(t):
-        parts = tuple(jnp.sign(span) * part for part in projected(rates, t, u, args))
+        parts = _onward(rates, t, u, args, span)
         excess, round_off, _ = _excess(step, dt, parts)
         # What is not finite is for others to find.
         unstable = jnp.maximum(length / dt, 1) * (excess - round_off) > np.log(_AMPLIFIED)
@@ -153,6 +153,11 @@ def check_steps(
     fine = Verdict(jnp.asarray(True), t0, (none,) * len(rates), jnp.full_like(t0, -jnp.inf))
     places = np.linspace(0, 1, _MANY) if closely else _PLACES
     return jax.lax.scan(worse, fine, t0 + span * jnp.asarray(places, t0.dtype))[0]
+
+
+def _onward(rates, t, u, args, span) -> tuple[Float[Array, "m m"], ...]:
+    """`projected`, in the direction of time of a run."""
+    return tuple(jnp.sign(span) * part for part in projected(rates, t, u, args))
 
 
 def _rank(u: PyTree[Array], count: int) -> int:

@@ -222,6 +222,16 @@ def test_a_solver_of_ones_own_is_looked_at():
     assert run(0.95 * limit, Midpoint(jnp.eye(24))).result == dfx.RESULTS.successful
 
 
+def test_steps_that_lead_beyond_all_numbers_are_refused_in_single_precision():
+    """Sixteen of them overflow, and that was taken for stable."""
+    rate = -np.linspace(0, 320, 8)
+    with jax.enable_x64(False):
+        for dt, grows in ((1e-3, False), (0.05, True), (0.2, True), (5.0, True)):
+            z = jnp.asarray(np.diag(dt * rate), jnp.float32)
+            growth = amplification_of(Midpoint()).growth(jnp.float32(dt), [z])
+            assert bool(growth > 1) == grows
+
+
 @pytest.mark.parametrize("solver", [dfx.Heun(), Midpoint(), js.IMEX(order=2)])
 def test_steps_of_a_controller_of_ones_own_are_watched(solver):
     """Fields came back with values of 2e9 to 2e13, from zero too."""

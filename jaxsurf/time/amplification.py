@@ -168,7 +168,9 @@ class Measured(AbstractAmplification):
     def growth(self, dt, parts):
         first, *later = _steps(self.solver, *jax.tree.map(jnp.asarray, (dt, list(parts))))
         half, end = map(log_radius, later)
-        found = jnp.where(jnp.isfinite(end), (end - half) / (_MEASURED // 2), log_radius(first))
+        # Sixteen unstable steps may be beyond all numbers: the first one tells then.
+        known = jnp.isfinite(half) & jnp.isfinite(end) & jnp.all(jnp.isfinite(later[1]))
+        found = jnp.where(known, (end - half) / (_MEASURED // 2), log_radius(first))
         return float(found) if isinstance(parts[0], np.ndarray) else found
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from .arguments import as_float, finite, instance, real, whole
+from .compiling import in_batches
 from .failures import is_concrete, refuse, unchecked
 from .indices import mask
 from .machine import COUNTED, block
@@ -235,7 +236,7 @@ def _search(
         return _pad(j, slots, i), _pad(mask, slots, False), good.sum()
 
     rows = (jnp.arange(n, dtype=jnp.int32), start, length)
-    indices, mask, count = jax.lax.map(lambda a: row(*a), rows, batch_size=batch_size)
+    indices, mask, count = in_batches(lambda a: row(*a), rows, batch_size)
     needed = length.sum(axis=1)
     full = jnp.asarray(slots, count.dtype)
     report = SearchReport(

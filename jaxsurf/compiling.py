@@ -260,6 +260,21 @@ def stored(a: jax.Array, never) -> jax.Array:
     return jax.lax.cond(never, jnp.zeros_like, lambda a: a, a)
 
 
+def in_batches(f: Callable, xs, size: int):
+    """`f` of each entry along the first axis, of so many at once at most, all batches of one size.
+
+    `jax.lax.map` would compile what is left over after whole batches a second time.
+    """
+    n = len(jax.tree.leaves(xs)[0])
+    batches = -(-n // size)
+    even = -(-n // batches)
+    missing = batches * even - n
+    if missing:
+        last = lambda a: jnp.broadcast_to(a[-1:], (missing, *a.shape[1:]))
+        xs = jax.tree.map(lambda a: jnp.concatenate([a, last(a)]), xs)
+    return jax.tree.map(lambda a: a[:n], jax.lax.map(f, xs, batch_size=even))
+
+
 def power_of_two(count: int) -> int:
     """The next one: what sizes are rounded up to, so that few programs are compiled."""
     return 1 << (count - 1).bit_length()

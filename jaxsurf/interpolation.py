@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from .blocks import blocks_of, rows_of
 from .build import determined
 from .cloud import PointCloud
-from .compiling import Pieces, copying_jit, namespace, on_device
+from .compiling import Pieces, copying_jit, in_batches, namespace, on_device
 from .failures import is_concrete, refuse
 from .fits.moments import blockwise, in_blocks, moment_solve
 from .fits.monomials import monomials
@@ -77,9 +77,8 @@ def _nearest(points, active, wanted):
         squared = jnp.sum((points - x) ** 2, axis=1)
         return jnp.argmin(squared if active is None else jnp.where(active, squared, jnp.inf))
 
-    return jax.lax.map(
-        nearest, jax.lax.stop_gradient(wanted), batch_size=block_of_pairs(PAIRS)
-    ).astype(jnp.int32)
+    wanted = jax.lax.stop_gradient(wanted)
+    return in_batches(nearest, wanted, block_of_pairs(PAIRS)).astype(jnp.int32)
 
 
 def _interpolation_weights(

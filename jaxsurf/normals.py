@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from .arguments import POINTS, as_float, as_many, in_range, instance, switched_off, whole
 from .checks import check_count, check_spacing
 from .cloud import PointCloud
-from .compiling import sized_jit
+from .compiling import in_batches, sized_jit
 from .failures import check, is_concrete, needs_values, not_finite, raise_at, warn
 from .fits.kernels import bell, enclosing
 from .fits.monomials import polynomial_count
@@ -302,13 +302,4 @@ def _refit(points, normals, slots, mask, radius, degree: int, iterations: int, b
         fitted, pivot = jax.lax.scan(step, normal, length=iterations)
         return jnp.where(mask[0], fitted, normal), pivot[-1]
 
-    # Whole blocks only: an incomplete one would be compiled a second time.
-    n = len(normals)
-    batch = min(block(batch_size), n)
-    which = jnp.arange(-(-n // batch) * batch) % n
-    results = jax.lax.map(
-        lambda r: row(*jax.tree.map(lambda a: a[r], (normals, slots, mask, radius))),
-        which,
-        batch_size=batch,
-    )
-    return jax.tree.map(lambda a: a[:n], results)
+    return in_batches(lambda r: row(*r), (normals, slots, mask, radius), block(batch_size))

@@ -23,7 +23,7 @@ from .build import stencil_weights
 from .cells import all_on, distance_key
 from .checks import DETOUR, LINK, RINGS, ring_size
 from .cloud import PointCloud
-from .compiling import sized_jit
+from .compiling import in_batches, sized_jit
 from .failures import unchecked
 from .machine import AGAIN, COUNTED, SHEETS, TRIED, block
 from .nearest import Grid, Nearest, nearest_in
@@ -128,9 +128,7 @@ class NeighborSearch(eqx.Module):
 @sized_jit
 def _candidates(grid, reach: int):
     rows = jnp.arange(len(grid.order), dtype=jnp.int32)
-    return jax.lax.map(
-        lambda i: grid.candidates(i[None], reach)[1][0], rows, batch_size=block(COUNTED)
-    )
+    return in_batches(lambda i: grid.candidates(i[None], reach)[1][0], rows, block(COUNTED))
 
 
 @sized_jit
@@ -355,7 +353,7 @@ def _lists(grid: Grid, rings: _Rings, rows, k: int, tier: Tier) -> _Lists:
         d = len(grid.cells)
         x, normals = jnp.stack(grid.given[:d], axis=1), jnp.stack(grid.given[d:], axis=1)
         find = lambda row: _without_islands(x, normals, rings, k, *row)
-        found = jax.lax.map(find, (rows, candidates.T, good.T), batch_size=block(SHEETS))
+        found = in_batches(find, (rows, candidates.T, good.T), block(SHEETS))
         return tuple(jnp.where(held, a.T, b) for a, b in zip(found, usual))
 
     indices, mask = jax.lax.cond(jnp.any(held), apart, lambda: usual)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool
 
 from ..arguments import switched_off
 from ..cloud import PointCloud
+from ..compiling import in_batches
 from ..machine import PAIRS, block_of_pairs
 from ..neighbors import Neighbors
 
@@ -106,4 +107,4 @@ def _probes(rows):
 
 def _looked_from(look, n: int):
     """What is seen from some points, evenly over the list."""
-    return jax.lax.map(look, _probes(jnp.arange(n)), batch_size=block_of_pairs(PAIRS))
+    return in_batches(look, _probes(jnp.arange(n)), block_of_pairs(PAIRS))

@@ -15,6 +15,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from ..arguments import instance, switched_off, whole
+from ..compiling import in_batches
 from ..discretization import Discretization
 from ..machine import PAIRS, block_of_pairs
 
@@ -62,7 +63,7 @@ def _energy(x, normals, areas, power: int):
 
     # Recomputed in reverse mode: nothing of the size of all pairs is kept.
     each = (jnp.arange(len(x)), x, normals, areas)
-    rows = jax.lax.map(jax.checkpoint(seen_from), each, batch_size=block_of_pairs(PAIRS))
+    rows = in_batches(jax.checkpoint(seen_from), each, block_of_pairs(PAIRS))
     return jnp.sum(rows) / 2**power
 
 
@@ -105,7 +106,7 @@ def _radius(x, normals, on):
     fixed = stop_gradient(x)
     other = lambda one: jnp.argmax(switched_off(on, _bends(one[0], one[1], one[2], fixed), -1))
     each = (jnp.arange(len(x)), fixed, stop_gradient(normals))
-    apart = x[jax.lax.map(other, each, batch_size=block_of_pairs(PAIRS))] - x
+    apart = x[in_batches(other, each, block_of_pairs(PAIRS))] - x
     squared = _squared(jnp.sum(apart * normals, axis=1), jnp.sum(apart**2, axis=1))
     plane = squared == 0
     return jnp.where(plane, jnp.inf, 1 / jnp.sqrt(jnp.where(plane, 1, squared)))

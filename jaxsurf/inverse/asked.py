@@ -94,7 +94,7 @@ def in_sight(problem: Problem, theta) -> tuple[Problem, PyTree]:
     free = [x for prior, x in pairs(problem.prior, theta) if prior is None]
     if not free:
         return problem, strong(problem.whitened(theta))
-    columns = free_columns(problem, strong(problem.whitened(theta)))
+    columns = free_columns(problem, theta)
     sizes = told_apart(np.asarray(columns), "the first theta")
     units = iter(ravel_pytree(free)[1](jnp.asarray(1 / sizes, sizes.dtype)))
     unit = each(lambda prior, x: next(units) if prior is None else x, problem.prior, problem.unit)

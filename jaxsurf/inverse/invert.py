@@ -228,7 +228,7 @@ def _run(problem, theta, optimizer, steps, linear_steps, tol) -> tuple[Inversion
         missed = float(jnp.mean(now.residual**2)) > _MISSED
         if optimizer is None:
             step, gradient, falls, linear = newton(
-                problem, xi, np.asarray(forcing), np.asarray(linear_steps)
+                problem, xi, now, np.asarray(forcing), np.asarray(linear_steps)
             )
             size, decrement = size_of(gradient), jnp.sqrt(jnp.maximum(-falls, 0))
             after = gradient, falls
@@ -304,6 +304,6 @@ def _found(problem: Problem, xi, now: Seen, rows, stopped: str) -> Inversion:
     predictions = jax.tree.map(lambda d, s, r: d + s * r, problem.data, problem.noise, off)
     history = {name: np.array(values) for name, values in rows.items()}
     return Inversion(
-        problem.theta(xi), predictions, now.energy, jnp.mean(now.residual**2), history,
+        now.theta, predictions, now.energy, jnp.mean(now.residual**2), history,
         stopped == "converged", stopped, problem, xi,
     )  # fmt: skip

@@ -73,10 +73,10 @@ class Posterior(eqx.Module):
         if not jnp.issubdtype(getattr(found, "dtype", object), jnp.floating):
             what = getattr(found, "dtype", type(found).__name__)
             raise TypeError(f"quantity returns {what}, expected an array of floating-point numbers")
-        rows = jax.jacrev(lambda xi: quantity(self.problem.theta(xi)))(self.xi)
+        rows = jax.jacrev(quantity)(self.mean)
         shape = found.shape
         rows = jax.tree.map(lambda a: a.reshape(-1, *a.shape[len(shape) :]), rows)
-        flat = jax.vmap(lambda row: ravel_pytree(row)[0])(rows)
+        flat = _in_noise(self, rows)
         before = jnp.sum((flat * self.known) ** 2, axis=1)
         less = jnp.sum((self.factor @ flat.T) ** 2, axis=0)
         more = jnp.sum((flat @ self.rest) ** 2, axis=1)
@@ -97,7 +97,7 @@ def posterior_of(problem: Problem, xi: PyTree, mean: PyTree, scaled: bool) -> Po
     flat, unravel = ravel_pytree(xi)
     known = ravel_pytree(problem.known(unravel(jnp.ones_like(flat))))[0]
     m = sum(x.size for x in jax.tree.leaves(problem.data))
-    slopes = jacobian(problem, xi, rows=m <= flat.size)
+    slopes = jacobian(problem, xi, mean, rows=m <= flat.size)
     told_apart(np.asarray(slopes)[:, np.asarray(known) == 0], "what was found", scaled=scaled)
     factor, rest = _factors(slopes, known, int(jnp.sum(known == 0)))
     return Posterior(mean, problem, xi, known, factor, rest)
@@ -119,6 +119,13 @@ def _factors(slopes, known, free: int):
     spread = solve_triangular(upper, jnp.eye(free, dtype=upper.dtype), lower=False)
     rest = -(factor.T @ theirs) @ spread
     return factor, rest.at[where].set(spread)
+
+
+@sized_jit
+def _in_noise(posterior: Posterior, rows):
+    """Derivatives in the noise, of those in the unknowns."""
+    pull = jax.vjp(posterior.problem.theta, posterior.xi)[1]
+    return jax.vmap(lambda row: ravel_pytree(pull(row))[0])(rows)
 
 
 @sized_jit

@@ -13,12 +13,11 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ..compiling import sized_jit
+from ..compiling import in_batches, sized_jit
 from ..failures import marking, needs_values
 from ..machine import PUSHED
 from ..time.run import forwards
@@ -70,23 +69,25 @@ class Problem(eqx.Module):
         """What of the noise has a prior, zero elsewhere."""
         return each(lambda prior, x: 0 * x if prior is None else x, self.prior, xi)
 
-    def residual(self, xi: PyTree) -> Float[Array, " m"]:
+    def residual(self, theta: PyTree) -> Float[Array, " m"]:
         """Data that are missed, in standard deviations."""
-        predicted = self.forward(self.theta(xi), *self.args)
+        predicted = self.forward(theta, *self.args)
         off = lambda f, d, s: (f - d) / s
         return ravel_pytree(jax.tree.map(off, predicted, self.data, self.noise))[0]
 
-    def energy(self, xi: PyTree) -> tuple[Float[Array, ""], Float[Array, " m"]]:
-        """J, and the residual."""
-        residual = self.residual(xi)
-        return (jnp.sum(residual**2) + inner(self.known(xi), xi)) / 2, residual
+    def energy(self, xi: PyTree) -> tuple[Float[Array, ""], tuple[Float[Array, " m"], PyTree]]:
+        """J; and the residual and the unknowns."""
+        theta = self.theta(xi)
+        residual = self.residual(theta)
+        return (jnp.sum(residual**2) + inner(self.known(xi), xi)) / 2, (residual, theta)
 
 
 class Seen(NamedTuple):
-    """J at a place, the residual, and the gradient where that was asked for."""
+    """J at a place, the residual, the unknowns, and the gradient where that was asked for."""
 
     energy: Float[Array, ""]
     residual: Float[Array, " m"]
+    theta: PyTree
     gradient: PyTree = None
 
 
@@ -100,7 +101,7 @@ def size_of(a: PyTree) -> Float[Array, ""]:
 
 
 def along(xi: PyTree, step: PyTree, scale: Any) -> PyTree:
-    return jax.tree.map(lambda x, s: x + scale * s, xi, step)
+    return jax.tree.map(lambda x, s: (x + scale * s).astype(x.dtype), xi, step)
 
 
 @contextlib.contextmanager
@@ -135,56 +136,80 @@ def _known(found: Any) -> Any:
     return found
 
 
-def newton(problem: Problem, xi: PyTree, tolerance: Any, max_steps: Any):
+def newton(problem: Problem, xi: PyTree, now: Seen, tolerance: Any, max_steps: Any):
     """The step of Gauss and Newton, the gradient, the slope along the step, steps of the solver."""
     with _failing_softly():
-        return _newton(problem, xi, tolerance, max_steps)
+        return _newton(problem, xi, now, tolerance, max_steps)
 
 
-def jacobian(problem: Problem, xi: PyTree, rows: bool) -> Float[Array, "m p"]:
+def jacobian(problem: Problem, xi: PyTree, theta: PyTree, rows: bool) -> Float[Array, "m p"]:
     """Of the residual, row by row in reverse or column by column in forward mode."""
     with _failing_softly():
-        return _jacobian(problem, xi, rows)
+        return _jacobian(problem, xi, theta, rows)
 
 
 @sized_jit
 def _seen(problem, xi):
-    return Seen(*problem.energy(xi))
+    energy, others = problem.energy(xi)
+    return Seen(energy, *others)
 
 
 @sized_jit
 def _slope(problem, xi):
-    (energy, residual), gradient = jax.value_and_grad(problem.energy, has_aux=True)(xi)
-    return Seen(energy, residual, gradient)
+    (energy, others), gradient = jax.value_and_grad(problem.energy, has_aux=True)(xi)
+    return Seen(energy, *others, gradient)
 
 
-def _pushed(f: Callable, x: PyTree) -> Callable:
-    """Products with its Jacobian."""
+# Unknowns are given beside their noise: what would find them again is compiled nowhere.
+
+
+def _pushed(problem: Problem, xi: PyTree, theta: PyTree) -> Callable:
+    """Products with the Jacobian of the residual, in the noise."""
+    colored = jax.linearize(problem.theta, xi)[1]
     with forwards():
-        return jax.linearize(f, x)[1]
+        missed = jax.linearize(problem.residual, theta)[1]
+    return lambda s: missed(colored(s))
+
+
+def _pulled(problem: Problem, xi: PyTree, theta: PyTree) -> Callable:
+    """Those with its transpose."""
+    colored = jax.vjp(problem.theta, xi)[1]
+    missed = jax.vjp(problem.residual, theta)[1]
+    return lambda r: colored(*missed(r))[0]
 
 
 @sized_jit
-def _newton(problem, xi, tolerance, max_steps):
-    push = _pushed(problem.residual, xi)
-    residual, pulled = jax.vjp(problem.residual, xi)
-    pull = lambda r: pulled(r)[0]
-    plus = lambda a, b: jax.tree.map(jnp.add, a, b)
-    gradient = plus(pull(residual), problem.known(xi))
-    hessian = lx.FunctionLinearOperator(
-        lambda s: plus(pull(push(s)), problem.known(s)),
-        jax.eval_shape(lambda: xi),
-        lx.positive_semidefinite_tag,
-    )
-    size = size_of(gradient)
-    # lineax compares component by component, in which a right-hand side may pass through zero.
-    small = jnp.where(size > 0, size, 1) * tolerance
-    # Residuals from the recurrence: another product to renew them is as much again to compile, and
-    # steps are solved for to a few digits.
-    solver = lx.CG(0.0, small, norm=size_of, stabilise_every=None, max_steps=max_steps)
-    down = jax.tree.map(jnp.negative, gradient)
-    found = lx.linear_solve(hessian, down, solver, throw=False)
-    return found.value, gradient, inner(found.value, gradient), found.stats["num_steps"]
+def _newton(problem, xi, now: Seen, tolerance, max_steps):
+    """By conjugate gradients, to residuals and last moves of this share of the gradient.
+
+    The gradient is found in their loop, the first time round: the linearised model and its adjoint,
+    which are nearly all of the program, are compiled once. (Those of lineax have them three times.)
+    """
+    push, pull = (f(problem, xi, now.theta) for f in (_pushed, _pulled))
+    down = lambda a: jax.tree.map(jnp.negative, a)
+
+    def more(carry):
+        count, gradient, step, left, p, squared, _ = carry
+        first = count == 0
+        pick = lambda a, b: jax.tree.map(lambda a, b: jnp.where(first, a, b), a, b)
+        w = along(pull(pick(now.residual, push(p))), problem.known(pick(xi, p)), 1)
+        length = squared / inner(p, w)
+        moved = jnp.where(first, jnp.inf, length**2 * inner(p, p))
+        step = pick(step, along(step, p, length))
+        left = pick(down(w), along(left, w, -length))
+        remains = inner(left, left)
+        p = pick(left, along(left, p, remains / squared))
+        return count + 1, pick(w, gradient), step, left, p, remains, moved
+
+    def unfinished(carry):
+        count, gradient, *_, squared, moved = carry
+        large = jnp.maximum(squared, moved) > tolerance**2 * inner(gradient, gradient)
+        return (count == 0) | (large & (squared > 0) & (count <= max_steps))
+
+    none = jax.tree.map(jnp.zeros_like, xi)
+    start = (jnp.asarray(0), *[none] * 4, *[inner(none, none)] * 2)
+    count, gradient, step, *_ = jax.lax.while_loop(unfinished, more, start)
+    return step, gradient, inner(step, gradient), count - 1
 
 
 @sized_jit
@@ -217,34 +242,37 @@ def _descent(optimizer, problem, xi, now: Seen, state):
     return optimizer.update(now.gradient, state, xi, **about)
 
 
-def free_columns(problem: Problem, xi: PyTree) -> Float[Array, "m z"]:
+def free_columns(problem: Problem, theta: PyTree) -> Float[Array, "m z"]:
     """Of the Jacobian, those of unknowns without a prior."""
     with _failing_softly():
-        return _free_columns(problem, xi)
+        return _free_columns(problem, theta)
 
 
 @sized_jit
-def _free_columns(problem, xi):
-    free = [x for prior, x in pairs(problem.prior, xi) if prior is None]
+def _free_columns(problem, theta):
+    free = [x for prior, x in pairs(problem.prior, theta) if prior is None]
     flat, unravel = ravel_pytree(free)
 
     def residual(flat):
         ours = iter(unravel(flat))
         return problem.residual(
-            each(lambda prior, x: next(ours) if prior is None else x, problem.prior, xi)
+            each(lambda prior, x: next(ours) if prior is None else x, problem.prior, theta)
         )
 
-    push = _pushed(residual, flat)
-    return jax.lax.map(push, jnp.eye(flat.size, dtype=flat.dtype), batch_size=PUSHED).T
+    with forwards():
+        push = jax.linearize(residual, flat)[1]
+    return in_batches(push, jnp.eye(flat.size, dtype=flat.dtype), PUSHED).T
 
 
 @sized_jit
-def _jacobian(problem, xi, rows):
-    flat, unravel = ravel_pytree(xi)
-    of_flat = lambda flat: problem.residual(unravel(flat))
+def _jacobian(problem, xi, theta, rows):
     if not rows:
-        push = _pushed(of_flat, flat)
-        return jax.lax.map(push, jnp.eye(flat.size, dtype=flat.dtype), batch_size=PUSHED).T
-    residual, pulled = jax.vjp(of_flat, flat)
-    pull = lambda r: pulled(r)[0]
-    return jax.lax.map(pull, jnp.eye(residual.size, dtype=residual.dtype), batch_size=PUSHED)
+        flat, unravel = ravel_pytree(xi)
+        push = _pushed(problem, xi, theta)
+        columns = lambda e: push(unravel(e))
+        return in_batches(columns, jnp.eye(flat.size, dtype=flat.dtype), PUSHED).T
+    missed = jax.eval_shape(problem.residual, theta)
+    pull = _pulled(problem, xi, theta)
+    return in_batches(
+        lambda e: ravel_pytree(pull(e))[0], jnp.eye(missed.size, dtype=missed.dtype), PUSHED
+    )

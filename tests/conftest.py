@@ -47,12 +47,16 @@ import pytest
 from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
-if importlib.util.find_spec("beartype"):
+if importlib.util.find_spec("beartype") and not os.environ.get("NOHOOK"):
     from . import annotations  # noqa: F401, named below
 
     install_import_hook("jaxsurf", "tests.annotations.check")
 
-from jaxsurf import compiling
+from jaxsurf import arguments, compiling, failures, machine
+
+# Called so often that checks of them would take longer than those of all others.
+for _often in (arguments.is_array, failures.is_concrete, machine.machine):
+    _often.__no_type_check__ = True
 
 
 @pytest.fixture(scope="session")

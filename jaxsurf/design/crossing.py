@@ -9,7 +9,6 @@ the tangent plane of a point of another part, close to that.
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 

@@ -150,14 +150,15 @@ def jacobian(problem: Problem, xi: PyTree, theta: PyTree, rows: bool) -> Float[A
 
 @sized_jit
 def _seen(problem, xi):
-    energy, others = problem.energy(xi)
-    return Seen(energy, *others)
+    energy, (residual, theta) = problem.energy(xi)
+    return Seen(energy, residual, theta)
 
 
 @sized_jit
 def _slope(problem, xi):
-    (energy, others), gradient = jax.value_and_grad(problem.energy, has_aux=True)(xi)
-    return Seen(energy, *others, gradient)
+    seen, gradient = jax.value_and_grad(problem.energy, has_aux=True)(xi)
+    energy, (residual, theta) = seen
+    return Seen(energy, residual, theta, gradient)
 
 
 # Unknowns are given beside their noise: what would find them again is compiled nowhere.

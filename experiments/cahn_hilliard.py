@@ -49,7 +49,7 @@ def mode(k: int, j: int, points, count: int = 48) -> tuple[float, np.ndarray]:
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    n, width, end = (2_500, 0.12, 2.0) if quick else (6_000, 0.08, 4.0)
+    n, width, end = (1_500, 0.15, 1.0) if quick else (6_000, 0.08, 4.0)
     cloud = js.torus(n, _R, _r)
     laplacian = js.laplace_beltrami(cloud, method=_METHOD)
     # Rings of points as far apart as the points of a ring: all stand for the same area.

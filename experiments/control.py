@@ -142,7 +142,7 @@ def _picture(path: Path, start, end, work, history) -> None:
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    n, steps = (400, 20) if quick else (2_000, 150)
+    n, steps = (400, 12) if quick else (2_000, 150)
     start = js.discretize(js.sphere(n), method=_METHOD)
     theta = jnp.zeros((2, len(_BASIS)))
     found = js.optimize_shape(cost, Flow(start), theta, optimizer=optax.lbfgs(), steps=steps)

@@ -87,8 +87,8 @@ def ball(spacing: float, radii, run: js.Evolution) -> list[Row]:
 
 def run(quick: bool, out: Path) -> list[Row]:
     if quick:
-        rows, radii = followed(800, (2.5, 1.0), 0.25), (1.8, 1.0)
-        spacings, t1, saveat = (0.22,), 0.5, [0.0, 0.3]
+        rows, radii = followed(600, (2.5, 1.0), 0.25), (1.8, 1.0)
+        spacings, t1, saveat = (0.25,), 0.45, [0.0, 0.3]
     else:
         rows, radii = followed(10_000, _TORUS, 0.9), _TORUS
         spacings, t1, saveat = (0.3, 0.21, 0.15), 10.0, [0.0, 4.0, 5.0, 6.0, 7.0]

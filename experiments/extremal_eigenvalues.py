@@ -79,7 +79,7 @@ def _picture(path: Path, start, found: js.ShapeOptimization, first, sphere: floa
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    n = 1_000 if quick else 2_000
+    n = 700 if quick else 2_000
     star, theta = star_of(n), jnp.asarray(long_and_bumpy())
     # The lists of the sphere do not reach on it: made anew.
     start = jax.jit(lambda theta: (star(theta).cloud.points, star(theta).cloud.normals))(theta)

@@ -102,7 +102,7 @@ def _picture(path: Path, start, end, history) -> None:
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    n, steps = (600, 30) if quick else (4_000, 100)
+    n, steps = (600, 12) if quick else (4_000, 100)
     sphere = ball(n)
     star = js.star_shape(sphere, _DEGREE)
     found = js.optimize_shape(

@@ -47,7 +47,7 @@ def run(quick: bool, out: Path) -> list[Row]:
     if not quick:
         cases += [(2_000, fine), (2_000, other), (4_000, fine)]
     rows: list[Row] = []
-    last = 0.6 if quick else _LAST
+    last = 0.75 if quick else _LAST
     for n, method in cases:
         largest, mean, stats = error(n, method, last, solver=dfx.Tsit5(), rtol=1e-7, atol=1e-9)
         of_space = predicted(n, method, last)

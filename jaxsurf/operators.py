@@ -116,17 +116,18 @@ class Built(NamedTuple):
     cells: Cells | None = None
 
 
-def built(cloud, neighbors, method, cut: Cut | None = None) -> Built:
+def built(cloud, neighbors, method, cut: Cut | None = None, throw: bool = True) -> Built:
     """As `laplace_beltrami`, and what a method that shares its moments gives with it.
 
     Args:
         cut: cells are cut too, of a traced cloud.
+        throw: as there.
     """
     if not method.shares_moments:
-        return Built(laplace_beltrami(cloud, neighbors, method=method))
+        return Built(laplace_beltrami(cloud, neighbors, method=method, throw=throw))
     both = Joint((Laplacian(), Gradient()))
     if cut is None:
-        laplacian, gradient = build_all(cloud, neighbors, method, both, True)
+        laplacian, gradient = build_all(cloud, neighbors, method, both, throw)
         return Built(laplacian, gradient)
     (laplacian, gradient), cells = build_with(cloud, neighbors, method, both, cut)
     return Built(laplacian, gradient, cells_in_rows(cells, cloud.n))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# Of a surface along the longer side, unless more are asked for.
+_MOST = 600
+
 
 def plot_cloud(
     cloud: PointCloud,
@@ -31,7 +35,7 @@ def plot_cloud(
     limits: tuple[float, float] | None = None,
     view: tuple[float, float, float] = (1.0, -1.7, 0.9),
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
-    pixels: int = 600,
+    pixels: int | None = None,
 ) -> Axes:
     """Picture of a field on a surface, or on a curve in the plane.
 
@@ -52,7 +56,8 @@ def plot_cloud(
             (the colour bar then has a pointed end).
         view: direction from the surface to the viewer.
         up: direction that points up in the picture.
-        pixels: along the longer side.
+        pixels: along the longer side; if None twice as many as the axes have on the screen, and at
+            most 600.
 
     Returns:
         The axes.
@@ -68,11 +73,14 @@ def plot_cloud(
         >>> ax = js.plot_cloud(cloud, cloud.points[:, 2], label="height", pixels=100)
     """
     pyplot = pyplot_module()
-    check_arguments(cloud, cmap, limits, pixels)
+    check_arguments(cloud, cmap, limits, _MOST if pixels is None else pixels)
     values = None if field is None else values_of(field, cloud, "field")
-    scene = Scene.of(cloud, view, up, pixels)
     if ax is None:
         ax = pyplot.subplots(figsize=(6, 5), layout="constrained")[1]
+    if pixels is None:
+        extent = ax.get_window_extent()
+        pixels = min(_MOST, math.ceil(2 * max(extent.width, extent.height)))
+    scene = Scene.of(cloud, view, up, pixels)
     return _panel(ax, scene, values, label=label, title=title, cmap=cmap, limits=limits)
 
 
@@ -124,7 +132,7 @@ def plot_fields(
     limits: tuple[float, float] | None = None,
     view: tuple[float, float, float] = (1.0, -1.7, 0.9),
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
-    pixels: int = 600,
+    pixels: int = _MOST,
 ) -> Figure:
     """Several fields on the same cloud, side by side.
 

@@ -24,7 +24,7 @@ from .cells import all_on, distance_key
 from .checks import DETOUR, LINK, RINGS, ring_size
 from .cloud import PointCloud
 from .compiling import in_batches, sized_jit
-from .failures import unchecked
+from .failures import is_concrete, unchecked, without_derivatives
 from .machine import AGAIN, COUNTED, SHEETS, TRIED, block
 from .nearest import Grid, Nearest, nearest_in
 from .neighbors import Neighbors, Rows, with_near
@@ -131,13 +131,13 @@ def _candidates(grid, reach: int):
     return in_batches(lambda i: grid.candidates(i[None], reach)[1][0], rows, block(COUNTED))
 
 
-@sized_jit
 def renewed(
     search: NeighborSearch, cloud: PointCloud, before: Neighbors, cut: Cut | None = None
 ) -> tuple[Neighbors, Int[Array, " n"], Built]:
     """Lists of a moved cloud, a code for each, and operators that are built with them.
 
-    These are differentiated; all the rest is constant.
+    These are differentiated; all the rest is constant. On concrete arrays operators come from the
+    program that builds them anywhere, which is compiled by then.
 
     Args:
         before: lists of the same points before they moved. They say how far to look; a row without
@@ -145,26 +145,25 @@ def renewed(
         cut: as of `built`.
     """
     fixed = jax.tree.map(jax.lax.stop_gradient, cloud)
-    usual, code, (grid, rings) = usual_lists(search, fixed, before)
-    operators = built(cloud, usual, search.method, cut)
+    usual, code, found_by = usual_lists(search, fixed, before)
+    built_with = lambda lists: built(cloud, lists, search.method, cut, throw=False)
+    operators = built_with(usual)
     # Where the lists before had none, those of all points are even, or nearly.
     near = None if before.near is None else usual
     if not search.sizes:
         return with_near(usual, near), code, operators
-    lists = _Lists(usual.indices.T, usual.mask.T, code)
-    lists, changed = _adapted(search, grid, rings, fixed, lists, operators.laplacian)
-
-    # Rows that find no wider list keep the one from before.
-    changed = changed | jnp.any(lists.code != code)
-
-    def again():
-        adapted = _padded(lists, before, search.slots)
-        return adapted, built(cloud, adapted, search.method, cut)
-
-    adapted, operators = jax.lax.cond(changed, again, lambda: (usual, operators))
-    return with_near(adapted, near), lists.code, operators
+    diagnostics = jax.tree.map(jax.lax.stop_gradient, operators.laplacian.diagnostics)
+    adapted, code, changed = _adapted(search, found_by, fixed, before, usual, code, diagnostics)
+    known = without_derivatives(changed)
+    if not is_concrete(known):
+        again = lambda: (adapted, built_with(adapted))
+        adapted, operators = jax.lax.cond(changed, again, lambda: (usual, operators))
+    elif known:
+        operators = built_with(adapted)
+    return with_near(adapted, near), code, operators
 
 
+@sized_jit
 def usual_lists(search: NeighborSearch, cloud: PointCloud, before: Neighbors):
     """Lists of the usual size, a code for each, and what others are found with."""
     grid = _grid(cloud, _reach(cloud, before, search.k, search.tiers[0].k))
@@ -241,9 +240,12 @@ def _apart(search, grid, rings, found, lists) -> _Lists:
     return _for_rows(held, look, lists, AGAIN)
 
 
-def _adapted(search, grid, rings, cloud, lists, laplacian):
-    """Lists of other sizes where the usual one does not serve, and whether there are any."""
-    share = dominance(laplacian.diagnostics)
+@sized_jit
+def _adapted(search, found_by, cloud, before, usual, code, diagnostics):
+    """Lists of other sizes where the usual one does not serve, codes, and whether any changed."""
+    grid, rings = found_by
+    lists = _Lists(usual.indices.T, usual.mask.T, code)
+    share = dominance(diagnostics)
     border = jnp.zeros(cloud.n, bool) if cloud.boundary is None else cloud.boundary
     most = max(search.sizes)
 
@@ -272,7 +274,9 @@ def _adapted(search, grid, rings, cloud, lists, laplacian):
 
     poor = grid.on & (lists.code == 0) & (share < search.method.least_dominance)
     lists, changed = _for_rows(poor, look, (lists, jnp.zeros(cloud.n, bool)), TRIED)
-    return lists, jnp.any(changed)
+    # Rows that find no wider list keep the one from before.
+    changed = jnp.any(changed | (lists.code != code))
+    return _padded(lists, before, search.slots), lists.code, changed
 
 
 def _for_rows(which, look: Callable, state, size: int):

@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 
 import jax
-import matplotlib
 
 from .report import table, write_json
 
@@ -223,7 +222,8 @@ def _run(name: str, quick: bool, out: Path) -> int:
     try:
         experiment = importlib.import_module(f"experiments.{module}")
         if quick:  # surfaces in pictures are as fine as that
-            matplotlib.rcParams["figure.dpi"] = 40
+            pyplot = importlib.import_module("matplotlib.pyplot")
+            pyplot.rcParams["figure.dpi"] = 40
         # What is imported stays: full collections, of which tracing makes many, pass it by.
         gc.freeze()
         rows = experiment.run(quick, out)

@@ -266,7 +266,7 @@ def in_batches(f: Callable, xs, size: int):
     `jax.lax.map` would compile what is left over after whole batches a second time.
     """
     n = len(jax.tree.leaves(xs)[0])
-    batches = -(-n // size)
+    batches = max(-(-n // size), 1)
     even = -(-n // batches)
     missing = batches * even - n
     if missing:

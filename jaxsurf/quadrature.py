@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float
 from .blocks import blocks_of, rows_of
 from .build import determined
 from .cloud import PointCloud
-from .compiling import copying_jit, kept, namespace, sized_jit, stored
+from .compiling import Pieces, copying_jit, kept, namespace, sized_jit, stored
 from .failures import is_concrete, refuse, warn
 from .fits.graph import Graph
 from .fits.moments import blockwise, in_blocks, moment_solve
@@ -108,7 +108,7 @@ def cells_of(cloud: PointCloud, neighbors: Neighbors, method: AbstractMethod, bo
     blocks = blocks_of(cloud, neighbors, np.arange(cloud.n, dtype=np.int32), size)
 
     def by(cut: Cut) -> Cells:
-        return cells_in_rows(_cells_of_blocks(blocks, lines, cut), cloud.n)
+        return cells_in_rows(_cells_of_blocks((blocks, lines), cut), cloud.n)
 
     cells = by(cut)
     if is_concrete(cells.closed) and not np.all(cells.closed) and cut.sides < neighbors.k:
@@ -135,9 +135,9 @@ def cells_in_rows(blocks: Cells, count: int) -> Cells:
     return Cells(weights, *others)
 
 
-@sized_jit
-def _cells_of_blocks(blocks, lines, cut: Cut) -> Cells:
-    return blockwise(lambda block: cut(Neighborhood.of(*block[0]), block[1]), (blocks, lines))
+@Pieces
+def _cells_of_blocks(blocks, count, cut: Cut) -> Cells:
+    return blockwise(lambda block: cut(Neighborhood.of(*block[0]), block[1]), blocks, count)
 
 
 def areas(cells: Cells, neighbors: Neighbors, degree: int) -> Float[Array, " n"]:

@@ -79,7 +79,7 @@ def plot_cloud(
         ax = pyplot.subplots(figsize=(6, 5), layout="constrained")[1]
     if pixels is None:
         extent = ax.get_window_extent()
-        pixels = min(_MOST, math.ceil(2 * max(extent.width, extent.height)))
+        pixels = min(_MOST, max(1, math.ceil(2 * max(extent.width, extent.height))))
     scene = Scene.of(cloud, view, up, pixels)
     return _panel(ax, scene, values, label=label, title=title, cmap=cmap, limits=limits)
 

@@ -274,3 +274,34 @@ def test_steps_of_first_order_converge_in_any_unit(unit):
     assert abs(found.theta / unit - 2) < 1e-4
     # Where it begins at the likeliest there is nothing left to measure by.
     assert ask(found.theta).converged
+
+
+def test_unknowns_keep_their_precision():
+    """In double precision those of single, with or without a prior, beside others; and all of it in
+    single, where products of the first gradient are infinite (the step was zero: converged)."""
+    a = jnp.arange(6.0).reshape(3, 2) + 1
+    model = lambda x: jnp.concatenate([a @ x["free"] + x["known"][0], a @ x["known"][1]])
+    single = lambda *shape: jnp.zeros(shape, jnp.float32)
+    start = {"free": single(2), "known": (single(), jnp.zeros(2))}
+    one = js.GaussianPrior(1.0)
+    found = js.solve_inverse(
+        model, start, jnp.ones(6), noise=0.1, prior={"free": None, "known": (one, one)}
+    )
+    assert found.converged
+    for tree in (found.theta, found.posterior().deviation):
+        assert jax.tree.map(lambda x: x.dtype, tree) == jax.tree.map(lambda x: x.dtype, start)
+    b = np.random.default_rng(0).normal(size=(30, 12))
+    with jax.enable_x64(False):
+        b, truth = jnp.asarray(b, jnp.float32), jnp.linspace(-1e4, 1e4, 12)
+        found = js.solve_inverse(
+            lambda x: b @ x, jnp.zeros(12), b @ truth, noise=0.01, prior=js.GaussianPrior(1e4)
+        )
+        assert jnp.abs(found.theta - truth).max() < 0.1
+
+
+def test_directions_that_data_do_not_see_are_left():
+    """The derivative in the first unknown vanishes where J is least."""
+    model = lambda x: jnp.stack([x[0] ** 2, x[1], x[0] ** 2 + x[1]])
+    data = jnp.array([-1.0, 0.3, -0.7])
+    found = js.solve_inverse(model, jnp.array([1.0, 0.0]), data, noise=0.1)
+    np.testing.assert_allclose(found.theta, [0, -0.2], atol=1e-2)

@@ -97,7 +97,7 @@ def posterior_of(problem: Problem, xi: PyTree, mean: PyTree, scaled: bool) -> Po
     flat, unravel = ravel_pytree(xi)
     known = ravel_pytree(problem.known(unravel(jnp.ones_like(flat))))[0]
     m = sum(x.size for x in jax.tree.leaves(problem.data))
-    slopes = jacobian(problem, xi, mean, rows=m <= flat.size)
+    slopes = jacobian(problem, xi, mean, rows=m <= flat.size).astype(flat.dtype)
     told_apart(np.asarray(slopes)[:, np.asarray(known) == 0], "what was found", scaled=scaled)
     factor, rest = _factors(slopes, known, int(jnp.sum(known == 0)))
     return Posterior(mean, problem, xi, known, factor, rest)

@@ -20,8 +20,12 @@ from jaxtyping import Array, Float, PyTree
 from ..compiling import in_batches, sized_jit
 from ..failures import marking, needs_values
 from ..machine import PUSHED
+from ..solve.krylov import scale_of
 from ..time.run import forwards
 from .priors import AbstractPrior
+
+# Data see a direction where it bends J by more than so many roundings of one.
+_UNSEEN = 100
 
 
 def is_prior(x: Any) -> bool:
@@ -185,32 +189,41 @@ def _newton(problem, xi, now: Seen, tolerance, max_steps):
 
     The gradient is found in their loop, the first time round: the linearised model and its adjoint,
     which are nearly all of the program, are compiled once. (Those of lineax have them three times.)
+    It is solved for at size one: products of large numbers are infinite in single precision. A
+    direction that data do not see ends the loop.
     """
     push, pull = (f(problem, xi, now.theta) for f in (_pushed, _pulled))
-    down = lambda a: jax.tree.map(jnp.negative, a)
+    none = jax.tree.map(jnp.zeros_like, xi)
 
     def more(carry):
         count, gradient, step, left, p, squared, _ = carry
         first = count == 0
         pick = lambda a, b: jax.tree.map(lambda a, b: jnp.where(first, a, b), a, b)
         w = along(pull(pick(now.residual, push(p))), problem.known(pick(xi, p)), 1)
-        length = squared / inner(p, w)
-        moved = jnp.where(first, jnp.inf, length**2 * inner(p, p))
+        bent, size = inner(p, w), inner(p, p)
+        sound = first | (bent > _UNSEEN * jnp.finfo(bent.dtype).eps * size)
+        length = jnp.where(sound, squared / bent, 0)
         step = pick(step, along(step, p, length))
-        left = pick(down(w), along(left, w, -length))
-        remains = inner(left, left)
+        left = pick(along(none, w, -1 / _largest(w)), along(left, w, -length))
+        remains = jnp.where(sound, inner(left, left), 0)
         p = pick(left, along(left, p, remains / squared))
+        moved = jnp.where(first, jnp.inf, length**2 * size)
         return count + 1, pick(w, gradient), step, left, p, remains, moved
 
     def unfinished(carry):
         count, gradient, *_, squared, moved = carry
-        large = jnp.maximum(squared, moved) > tolerance**2 * inner(gradient, gradient)
+        small = tolerance * size_of(along(none, gradient, 1 / _largest(gradient)))
+        large = jnp.maximum(squared, moved) > small**2
         return (count == 0) | (large & (squared > 0) & (count <= max_steps))
 
-    none = jax.tree.map(jnp.zeros_like, xi)
     start = (jnp.asarray(0), *[none] * 4, *[inner(none, none)] * 2)
     count, gradient, step, *_ = jax.lax.while_loop(unfinished, more, start)
+    step = along(none, step, _largest(gradient))
     return step, gradient, inner(step, gradient), count - 1
+
+
+def _largest(a: PyTree) -> Float[Array, ""]:
+    return scale_of(ravel_pytree(a)[0])
 
 
 @sized_jit

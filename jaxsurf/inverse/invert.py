@@ -227,10 +227,10 @@ def _run(problem, theta, optimizer, steps, linear_steps, tol) -> tuple[Inversion
     while not stopped:
         missed = float(jnp.mean(now.residual**2)) > _MISSED
         if optimizer is None:
-            step, gradient, falls, linear = newton(
+            step, gradient, falls, linear, unseen = newton(
                 problem, xi, now, np.asarray(forcing), np.asarray(linear_steps)
             )
-            size, decrement = size_of(gradient), jnp.sqrt(jnp.maximum(-falls, 0))
+            size, decrement = size_of(gradient), jnp.sqrt(jnp.maximum(-falls, 0) + unseen)
             after = gradient, falls
             if before is not None:
                 step, falls = conjugate(step, *after, before)

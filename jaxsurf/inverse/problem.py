@@ -141,7 +141,10 @@ def _known(found: Any) -> Any:
 
 
 def newton(problem: Problem, xi: PyTree, now: Seen, tolerance: Any, max_steps: Any):
-    """The step of Gauss and Newton, the gradient, the slope along the step, steps of the solver."""
+    """The step of Gauss and Newton, the gradient, the slope along the step, steps of the solver.
+
+    And the square of what is left of the gradient along directions that data do not see.
+    """
     with _failing_softly():
         return _newton(problem, xi, now, tolerance, max_steps)
 
@@ -217,9 +220,10 @@ def _newton(problem, xi, now: Seen, tolerance, max_steps):
         return (count == 0) | (large & (squared > 0) & (count <= max_steps))
 
     start = (jnp.asarray(0), *[none] * 4, *[inner(none, none)] * 2)
-    count, gradient, step, *_ = jax.lax.while_loop(unfinished, more, start)
-    step = along(none, step, _largest(gradient))
-    return step, gradient, inner(step, gradient), count - 1
+    count, gradient, step, left, _, squared, _ = jax.lax.while_loop(unfinished, more, start)
+    step, left = (along(none, a, _largest(gradient)) for a in (step, left))
+    unseen = jnp.where(squared == 0, inner(left, left), 0)
+    return step, gradient, inner(step, gradient), count - 1, unseen
 
 
 def _largest(a: PyTree) -> Float[Array, ""]:

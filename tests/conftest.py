@@ -47,7 +47,7 @@ import pytest
 from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
-if importlib.util.find_spec("beartype") and not os.environ.get("NOHOOK"):
+if importlib.util.find_spec("beartype"):
     from . import annotations  # noqa: F401, named below
 
     install_import_hook("jaxsurf", "tests.annotations.check")

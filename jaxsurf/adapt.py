@@ -80,8 +80,10 @@ def represented(points, indices, mask, size, k: int) -> tuple[Any, Any]:
     """
     xp = namespace(mask)
     mask = mask & (xp.arange(mask.shape[1]) < size)
-    offsets = points[indices] - points[indices[:, :1]]
-    chosen = xp.where(xp.asarray(size) > k, _spread(xp, offsets, mask, k), mask)
+    chosen, wide = mask, xp.asarray(size) > k
+    if xp is jnp or wide.any():
+        offsets = points[indices] - points[indices[:, :1]]
+        chosen = xp.where(wide, _spread(xp, offsets, mask, k), mask)
     slots = xp.argsort(~chosen, axis=1, stable=True)[:, :k]
     held = xp.take_along_axis(chosen, slots, axis=1)
     found = xp.take_along_axis(indices, slots, axis=1)

@@ -2,13 +2,13 @@ r"""From a cloud to stencils: neighbourhoods chosen, weights in blocks, what is 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .adapt import dominance, is_better, report, represented, share_wanted, sizes_to_try
 from .adapt import residual_tolerance as residual_tolerance
@@ -252,55 +252,81 @@ def _chosen(cloud, method, throw, needed, fewest):
     neighbors = find_neighbors(cloud, k, throw=throw)
     _check_sizes(cloud, neighbors, method, Laplacian(), throw)
     found = stencil_weights(cloud, neighbors, method, Laplacian())
-    share = dominance(jax.tree.map(np.asarray, found[1]))
+    share = np.asarray(dominance(jax.tree.map(np.asarray, found[1])))
     poor = np.flatnonzero(on & needed & (share < method.least_dominance))
-    sizes, fewest = sizes_to_try(method, cloud.dim, k, available), k if fewest is None else fewest
-    border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
-    if not poor.size or not sizes:
-        report(cloud, neighbors, poor, share[poor], np.full(poor.size, k), method)
-        return neighbors, found
+    sizes = sizes_to_try(method, cloud.dim, k, available)
+    new, chosen, best = resized(cloud, neighbors, found, method, share, poor, sizes, fewest)
+    report(cloud, neighbors, poor, best, chosen, method)
+    return new
 
-    # Filled up with copies, so that few shapes are ever compiled.
-    rows = np.resize(poor, -(-poor.size // TRIED) * TRIED)
-    wide = nearest_of(cloud, rows, max(sizes))
-    points, chosen, best = np.asarray(cloud.points), np.full(rows.size, k), share[rows]
-    lists = np.asarray(neighbors.indices), np.asarray(neighbors.mask)
+
+def resized(
+    cloud: PointCloud,
+    neighbors: Neighbors,
+    found: tuple[Any, Diagnostics] | None,
+    method: AbstractMethod,
+    share: Float[np.ndarray, " n"],
+    poor: Int[np.ndarray, " r"],
+    sizes: Sequence[int],
+    fewest: int | None = None,
+) -> tuple[tuple[Neighbors, Any], Int[np.ndarray, " r"], Float[np.ndarray, " r"]]:
+    """Lists of which some rows are of other sizes, as far as these serve better; on the host.
+
+    Args:
+        found: what `stencil_weights` gives of the Laplacian; None if nobody asks for it.
+        share: see `dominance`.
+        poor: the rows.
+        sizes: to try in turn, see `sizes_to_try`.
+        fewest: points on a border; as many as there are if None.
+
+    Returns:
+        The lists, and what was found, with what was found of those rows; sizes and shares of them.
+    """
+    k, best, chosen = neighbors.k, share[poor], np.full(poor.size, neighbors.k)
+    if not poor.size or not sizes:
+        return (neighbors, found), chosen, best
+    fewest = k if fewest is None else fewest
+    border = np.zeros(cloud.n, bool) if cloud.boundary is None else np.asarray(cloud.boundary)
+    points, (near, good) = np.asarray(cloud.points), nearest_of(cloud, poor, max(sizes))
     # Rows last, as weights and diagnostics have them.
-    kept = [np.asarray(a)[..., rows] for a in (lists[0].T, lists[1].T, *jax.tree.leaves(found))]
+    olds = np.asarray(neighbors.indices).T, np.asarray(neighbors.mask).T, *jax.tree.leaves(found)
+    kept = [np.array(a)[..., poor] for a in olds]
     for size in sizes:
-        if (best >= method.least_dominance).all():
+        left = np.flatnonzero(best < method.least_dominance)
+        if not left.size:
             break
-        some = represented(points, *wide, size, k)
+        rows = poor[left]
+        some = represented(points, near[left], good[left], size, k)
         trial = _in_chunks(cloud, *some, method, rows)
         now = np.asarray(dominance(trial[1]))
         wanted = share_wanted(border[rows], share[rows], size, fewest, method)
-        better = is_better(now, best, wanted, method)
-        best = np.where(better, now, best)
-        chosen = np.where(better, size, chosen)
-        news = some[0].T, some[1].T, *jax.tree.leaves(trial)
-        kept = [np.where(better, new, old) for new, old in zip(news, kept)]
-    report(cloud, neighbors, poor, best[: poor.size], chosen, method)
+        better = is_better(now, best[left], wanted, method)
+        taken = left[better]
+        best[taken], chosen[taken] = now[better], size
+        for old, new in zip(kept, (some[0].T, some[1].T, *jax.tree.leaves(trial))):
+            old[..., taken] = new[..., better]
 
     def put(old, new):
         full = np.array(old)
-        full[..., rows] = new
+        full[..., poor] = new
         return full
 
-    olds = lists[0].T, lists[1].T, *jax.tree.leaves(found)
     indices, mask, *leaves = map(put, olds, kept)
     spread = neighbors if (chosen > k).any() else None
     new = Neighbors(on_device(indices.T), on_device(mask.T), near=spread)
-    return new, jax.tree.unflatten(jax.tree.structure(found), map(on_device, leaves))
+    known = jax.tree.unflatten(jax.tree.structure(found), map(on_device, leaves))
+    return (new, known), chosen, best
 
 
 def _in_chunks(cloud, indices, mask, method, rows):
     """Weights and diagnostics of the Laplacian of some rows, on the host."""
     parts = []
-    for start in range(0, len(rows), TRIED):
-        part = slice(start, start + TRIED)
+    # Filled up with copies, so that few shapes are ever compiled.
+    for part in np.resize(np.arange(len(rows)), (-(-len(rows) // TRIED), TRIED)):
         some = Rows(indices[part], mask[part])
         parts.append(stencil_weights(cloud, some, method, Laplacian(), rows[part]))
-    return jax.tree.map(lambda *a: np.concatenate([np.asarray(b) for b in a], axis=-1), *parts)
+    joined = lambda *a: np.concatenate([np.asarray(b) for b in a], axis=-1)[..., : len(rows)]
+    return jax.tree.map(joined, *parts)
 
 
 # --- checks --------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ dominant centre are taken out, some at a time, for as long as there are any.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -15,22 +16,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from .adapt import dominance, is_better, represented, share_wanted, sizes_to_try
 from .arguments import instance, real
-from .build import stencil_weights
-from .cells import all_on, distance_key
-from .checks import DETOUR, LINK, RINGS, ring_size
+from .build import resized, stencil_weights
+from .cells import all_on
+from .checks import RINGS
 from .cloud import PointCloud
-from .compiling import in_batches, sized_jit
+from .compiling import in_batches, on_device, sized_jit
 from .failures import is_concrete, unchecked, without_derivatives
-from .machine import AGAIN, COUNTED, SHEETS, TRIED, block
+from .islands import Rings, without_islands
+from .machine import AGAIN, COUNTED, CPU, SHEETS, TRIED, block, machine
 from .nearest import Grid, Nearest, nearest_in
-from .neighbors import Neighbors, Rows, with_near
+from .neighbors import Neighbors, Rows, find_neighbors, with_near
 from .operators import Built, built
 from .quadrature import Cut
-from .sheets import cosine_slack
 from .stencils.method import AbstractMethod
 from .stencils.targets import Laplacian
 
@@ -136,14 +137,17 @@ def renewed(
 ) -> tuple[Neighbors, Int[Array, " n"], Built]:
     """Lists of a moved cloud, a code for each, and operators that are built with them.
 
-    These are differentiated; all the rest is constant. On concrete arrays operators come from the
-    program that builds them anywhere, which is compiled by then.
+    These are differentiated; all the rest is constant. Known points of a CPU are searched by a k-d
+    tree: nothing is compiled for that, and it needs no room.
 
     Args:
         before: lists of the same points before they moved. They say how far to look; a row without
             room for a new list keeps that one.
         cut: as of `built`.
     """
+    if machine() is CPU and is_concrete(without_derivatives((cloud, before))):
+        with contextlib.suppress(ValueError):  # what is an error there is a code below
+            return _on_host(search, cloud, before, cut)
     fixed = jax.tree.map(jax.lax.stop_gradient, cloud)
     usual, code, found_by = usual_lists(search, fixed, before)
     built_with = lambda lists: built(cloud, lists, search.method, cut, throw=False)
@@ -163,6 +167,31 @@ def renewed(
     return with_near(adapted, near), code, operators
 
 
+def _on_host(search, cloud, before, cut):
+    fixed, method = without_derivatives(cloud), search.method
+    lists = find_neighbors(fixed, search.k, throw=False)
+    usual = _with_slots(lists, search.slots)
+    built_with = lambda lists: built(cloud, lists, method, cut, throw=False)
+    operators, code = built_with(usual), on_device(np.zeros(cloud.n, np.int32))
+    near = None if before.near is None else usual
+    diagnostics = without_derivatives(operators.laplacian.diagnostics)
+    share = np.asarray(dominance(jax.tree.map(np.asarray, diagnostics)))
+    poor = np.flatnonzero(fixed.host_active & (share < method.least_dominance))
+    (adapted, _), size, _ = resized(fixed, lists, None, method, share, poor, search.sizes)
+    if (size == search.k).all():
+        return with_near(usual, near), code, operators
+    adapted = _with_slots(adapted, search.slots)
+    return with_near(adapted, near), code, built_with(adapted)
+
+
+def _with_slots(lists: Neighbors, slots: int) -> Neighbors:
+    """Lists with as many slots or more; concrete."""
+    indices = np.tile(np.arange(lists.n, dtype=np.int32)[:, None], slots)
+    mask = np.zeros(indices.shape, bool)
+    indices[:, : lists.k], mask[:, : lists.k] = lists.indices, lists.mask
+    return unchecked(Neighbors, on_device(indices), on_device(mask))
+
+
 @sized_jit
 def usual_lists(search: NeighborSearch, cloud: PointCloud, before: Neighbors):
     """Lists of the usual size, a code for each, and what others are found with."""
@@ -170,7 +199,7 @@ def usual_lists(search: NeighborSearch, cloud: PointCloud, before: Neighbors):
     found, code = _usual(search, grid)
     on = all_on(cloud.points, cloud.active)
     code = jnp.where(on & ~grid.on, UNREACHED, code)  # not finite
-    rings = _Rings.of(grid, found)
+    rings = Rings.of(grid, found)
     lists = _Lists(found.indices[: search.k], found.mask[: search.k], code)
     lists = _apart(search, grid, rings, found, lists)
     return _padded(lists, before, search.slots), lists.code, (grid, rings)
@@ -315,38 +344,7 @@ def _wide(a, slots: int, value):
     return jnp.concatenate([a, jnp.broadcast_to(value, (more, a.shape[1])).astype(a.dtype)])
 
 
-# --- sheets told apart ---------------------------------------------------------------------
-
-
-class _Rings(eqx.Module):
-    """Which steps over the surface lead away from each point: to so many neighbours, so far.
-
-    Args:
-        length: of the longest step.
-        key: of the distance to the last neighbour that one may lead to.
-        index: its number.
-    """
-
-    length: Float[Array, " n"]
-    key: Int[Array, " n"]
-    index: Int[Array, " n"]
-
-    @classmethod
-    def of(cls, grid: Grid, found: Nearest) -> _Rings:
-        d = len(grid.cells)
-        count = min(len(found.indices), 2 * RINGS)
-        x = jnp.stack(grid.given[:d])
-
-        def squared(slot):
-            return jnp.sum((x[:, found.indices[slot]] - x) ** 2, axis=0)
-
-        key = distance_key(squared(count - 1))
-        key = jnp.where(found.mask[count - 1], key, jnp.iinfo(key.dtype).max)
-        length = LINK * jnp.sqrt(squared(min(ring_size(d), count) - 1))
-        return cls(length, key, found.indices[count - 1])
-
-
-def _lists(grid: Grid, rings: _Rings, rows, k: int, tier: Tier) -> _Lists:
+def _lists(grid: Grid, rings: Rings, rows, k: int, tier: Tier) -> _Lists:
     """The rows of `find_neighbors(cloud, k)`."""
     wide = nearest_in(grid, rows, tier.k, reach=tier.reach, count=tier.candidates, few=True)
     candidates, good = wide.indices[: 2 * k], wide.mask[: 2 * k]
@@ -356,7 +354,7 @@ def _lists(grid: Grid, rings: _Rings, rows, k: int, tier: Tier) -> _Lists:
     def apart():
         d = len(grid.cells)
         x, normals = jnp.stack(grid.given[:d], axis=1), jnp.stack(grid.given[d:], axis=1)
-        find = lambda row: _without_islands(x, normals, rings, k, *row)
+        find = lambda row: without_islands(x, normals, rings, k, *row)
         found = in_batches(find, (rows, candidates.T, good.T), block(SHEETS))
         return tuple(jnp.where(held, a.T, b) for a, b in zip(found, usual))
 
@@ -365,32 +363,3 @@ def _lists(grid: Grid, rings: _Rings, rows, k: int, tier: Tier) -> _Lists:
     lost = ~mask[-1] & ~jnp.where(held, good[-1], False) & ~wide.all
     code = jnp.where(wide.crowded, CROWDED, jnp.where(lost, UNREACHED, 0))
     return _Lists(indices, mask, code)
-
-
-def _without_islands(points, normals, rings, k: int, row, found, good):
-    """What a short way over the surface leads to, of the candidates of one row."""
-    x, normal = points[found], normals[found]
-    d = x - x[:, None]
-    squared = jnp.sum(d * d, axis=2)
-    length = jnp.sqrt(squared)
-    both = normal + normal[:, None]
-    # A chord of a smooth curve makes equal angles with the normals at its ends.
-    rise = jnp.abs(jnp.sum(d * both, axis=2))
-    along = rise <= 0.5 * length * jnp.sqrt(jnp.sum(both * both, axis=2))
-    key, last = distance_key(squared), rings.key[found][:, None]
-    among = (key < last) | ((key == last) & (found <= rings.index[found][:, None]))
-    accepted = normal @ normal.T >= -cosine_slack(x.dtype)
-    step = along & among & accepted & (length > 0) & (length <= rings.length[found][:, None])
-    link = jnp.where(step & good & good[:, None], length, jnp.inf)
-    link = jnp.minimum(link, link.T)
-
-    def longer(ways):
-        return ways[1], jnp.minimum(ways[1], jnp.min(ways[1][:, None] + link, axis=0))
-
-    start = jnp.where(jnp.arange(len(found)) == 0, 0, link[0])
-    none = jnp.full_like(start, jnp.nan)
-    way = jax.lax.while_loop(lambda ways: jnp.any(ways[0] != ways[1]), longer, (none, start))[1]
-    kept = good & (way <= DETOUR * jnp.sqrt(jnp.sum((x - points[row]) ** 2, axis=1)))
-    order = jnp.argsort(~kept, stable=True)[:k]
-    mask = kept[order]
-    return jnp.where(mask, found[order], row), mask

@@ -297,12 +297,12 @@ class Discretization(eqx.Module):
             normals: new unit normals; if None those of the tangents carried along by the motion,
                 $n \propto F t_1 \times F t_2$ with F the gradient of the new positions on the
                 surface as it was.
-            search: finds the neighbours anew and adapts them, as `choose_neighbors` does, in
+            search: finds the neighbours anew and adapts them, as `choose_neighbors` does, also in
                 compiled code; from `Discretization.search`. If None they are the same as before.
 
         Returns:
             The moved surface. Its spacing, if it has one, is stretched with its area. A row for
-            which a search has no room keeps the neighbours it had, and a code says so.
+            which a search has no room, in compiled code, keeps those it had; a code says so.
 
         Accuracy: normals as `gradient`, $O(h^p)$; of rotations and changes of scale to round-off
             (`tests/test_discretization.py::test_moved_surfaces_are_new_ones`). Neighbours found

@@ -208,26 +208,25 @@ def refit_normals(
     whole(batch_size, "batch_size", least=1)
     needed = polynomial_count(points.shape[1] - 1, whole(degree, "degree", least=1))
     _check_fit(neighbors.k, degree, needed)
-    on, count = neighbors.mask[:, 0], neighbors.mask.sum(axis=1)
+    mask = np.asarray(neighbors.mask) if is_concrete(neighbors.mask) else neighbors.mask
+    on, count = mask[:, 0], mask.sum(axis=1)
     text = f"point {{i}} has {{v}} neighbours, degree {degree} needs at least {needed}"
     check(count, lambda count, on: on & (count < needed), text, on)
     radius = neighbors.radius
     if radius is not None:
         radius = jnp.broadcast_to(jnp.asarray(radius, points.dtype), n)
-    slots, accepted = neighbors.indices, neighbors.mask
-    given, points = normals, switched_off(on, points)
-    normals = switched_off(on, given, np.eye(points.shape[1])[0])
-    fitted, pivot = _refit(points, normals, slots, accepted, radius, degree, iterations, batch_size)
-    determined = pivot > needed * jnp.finfo(points.dtype).eps
-    fitted = jnp.where(determined[:, None], fitted, jnp.nan)
-    cosine = jnp.sum(fitted * normals, axis=1)
+    some = None if is_concrete(on) and np.all(on) else on
+    given, points = normals, switched_off(some, points)
+    normals = switched_off(some, given, np.eye(points.shape[1])[0])
+    lists = neighbors.indices, neighbors.mask, radius
+    fitted, cosine = _turned(points, normals, *lists, degree, iterations, batch_size)
     text = (
         "the fit turned the normal of point {i} over (cosine {v:.2f} with the one given): "
         "the points do not resolve the surface there, use more points or a lower degree"
     )
     check(cosine, lambda cosine, on: on & ~(cosine > 0), text, on)
     if is_concrete(cosine, on):
-        return switched_off(on, fitted, given)
+        return switched_off(some, fitted, given)
     bad = on & ((count < needed) | ~(cosine > 0))
     return switched_off(on, jnp.where(bad[:, None], jnp.nan, fitted), given)
 
@@ -303,3 +302,13 @@ def _refit(points, normals, slots, mask, radius, degree: int, iterations: int, b
         return jnp.where(mask[0], fitted, normal), pivot[-1]
 
     return in_batches(lambda r: row(*r), (normals, slots, mask, radius), block(batch_size))
+
+
+@sized_jit
+def _turned(points, normals, slots, mask, radius, degree: int, iterations: int, batch_size: int):
+    """New normals, NaN where nothing determines them, and their cosines with those before."""
+    fitted, pivot = _refit(points, normals, slots, mask, radius, degree, iterations, batch_size)
+    needed = polynomial_count(points.shape[1] - 1, degree)
+    determined = pivot > needed * jnp.finfo(points.dtype).eps
+    fitted = jnp.where(determined[:, None], fitted, jnp.nan)
+    return fitted, jnp.sum(fitted * normals, axis=1)

@@ -7,7 +7,6 @@ dominant centre are taken out, some at a time, for as long as there are any.
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -68,7 +67,7 @@ class NeighborSearch(eqx.Module):
         sizes: of other neighbourhoods, tried in turn where the Laplacian has no dominant centre.
         slots: of the lists.
         tiers: the searches for all rows, for those with points out of reach or on another sheet,
-            and for those that are adapted.
+            and for those that are adapted; none if points will be known, and on a CPU.
 
     Example:
         >>> surface = js.discretize(js.sphere(500), method=js.GFDM(degree=2))
@@ -83,13 +82,13 @@ class NeighborSearch(eqx.Module):
     k: int = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
     slots: int = eqx.field(static=True)
-    tiers: tuple[Tier, Tier, Tier] = eqx.field(static=True)
+    tiers: tuple[Tier, ...] = eqx.field(static=True)
 
     def __check_init__(self):
         instance(self.method, AbstractMethod, "method", "GFDM(degree=2), say")
         if self.slots < self.k:
             raise ValueError(f"slots = {self.slots}, for k = {self.k} neighbours at least {self.k}")
-        if len(self.tiers) != 3:
+        if len(self.tiers) not in (0, 3):
             raise ValueError(f"tiers: {len(self.tiers)} searches, 3 are needed")
 
     @classmethod
@@ -99,12 +98,15 @@ class NeighborSearch(eqx.Module):
         neighbors: Neighbors,
         method: AbstractMethod,
         margin: float,
+        known: bool = False,
     ) -> NeighborSearch:
-        """With room for what these points need, times a margin."""
+        """With room for what these points need, times a margin; for known ones none on a CPU."""
         real(margin, "margin", least=1)
         d, available = cloud.dim, int(cloud.host_active.sum())
         k = min(method.neighbor_count(d), available)
         sizes = tuple(sizes_to_try(method, d, k, available))
+        if known and machine() is CPU:
+            return cls(method, k, sizes, max(k, neighbors.k), ())
         usual = min(max(k, 2 * RINGS), available)
         grid = _grid(cloud, _reach(cloud, neighbors, k, usual))
 
@@ -146,8 +148,13 @@ def renewed(
         cut: as of `built`.
     """
     if machine() is CPU and is_concrete(without_derivatives((cloud, before))):
-        with contextlib.suppress(ValueError):  # what is an error there is a code below
+        try:
             return _on_host(search, cloud, before, cut)
+        except ValueError:  # which is a code below
+            if not search.tiers:
+                raise
+    if not search.tiers:
+        raise ValueError("search has no room for points that are not known: see surface.search()")
     fixed = jax.tree.map(jax.lax.stop_gradient, cloud)
     usual, code, found_by = usual_lists(search, fixed, before)
     built_with = lambda lists: built(cloud, lists, search.method, cut, throw=False)
@@ -172,7 +179,7 @@ def _on_host(search, cloud, before, cut):
     lists = find_neighbors(fixed, search.k, throw=False)
     usual = _with_slots(lists, search.slots)
     built_with = lambda lists: built(cloud, lists, method, cut, throw=False)
-    operators, code = built_with(usual), on_device(np.zeros(cloud.n, np.int32))
+    operators, code = built_with(usual), on_device(np.zeros(cloud.n, int))
     near = None if before.near is None else usual
     diagnostics = without_derivatives(operators.laplacian.diagnostics)
     share = np.asarray(dominance(jax.tree.map(np.asarray, diagnostics)))

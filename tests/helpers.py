@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsurf as js
-from jaxsurf.moving import follow
+from jaxsurf.moving import parts
 
 METHODS = [
     js.DCPSE(order=2),
@@ -177,8 +177,8 @@ def killed(run, monkeypatch, writes=1):
         if len(done) == writes:
             raise Killed
 
-    written, done = follow.written, []
-    monkeypatch.setattr(follow, "written", write_and_die)
+    written, done = parts.written, []
+    monkeypatch.setattr(parts, "written", write_and_die)
     with pytest.raises(Killed):
         run("killed")
     monkeypatch.undo()

@@ -103,6 +103,10 @@ def _inflated(t, surface, fields, args):
     return args * surface.cloud.normals
 
 
+def _stretched(t, surface, fields, args):
+    return args * surface.cloud.points * jnp.array([0.5, -0.2, 0.0])
+
+
 _TIMES = np.linspace(0.1, 2.0, 20)
 
 
@@ -214,10 +218,20 @@ CALLS: dict[str, tuple[str, str, Callable]] = {
         lambda m: m.surface.interpolate(m.u, m.cloud.points[::2]),
     ),
     "moved": ("closed", "surface", lambda m: m.surface.moved(1.1 * m.cloud.points).laplacian),
+    "moved, neighbours anew": (
+        "closed",
+        "surface",
+        lambda m: m.surface.moved(1.1 * m.cloud.points, search=m.surface.search()).laplacian,
+    ),
     "evolve": (
         "closed",
         "surface",
         lambda m: _last(js.evolve(js.Motion(_inflated), m.surface, t1=0.1, args=m.number)),
+    ),
+    "evolve, neighbours anew": (
+        "closed",
+        "surface",
+        lambda m: _last(js.evolve(js.Motion(_stretched), m.surface, t1=1.0, args=m.number)),
     ),
     "evolve, heat": (
         "closed",

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -15,17 +14,18 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
-from ..arguments import is_array
+from ..compiling import on_device
 from ..discretization import Discretization, discretize
 from ..failures import is_concrete
 from ..functions import canonical
 from ..motion import unreached
 from ..renew import NeighborSearch
-from ..time.checkpoint import Checkpoint, digest, read_back, written
+from ..time.checkpoint import Checkpoint, digest
 from ..time.integrate import IntegrationError, integrate
 from ..time.run import planned
 from .adaptation import Adaptation, changed, conserved
 from .contact import Contact, parts_after, watched, without_other_parts
+from .parts import File, Place, Progress, ends_of
 from .problem import Moving, fitted_normals, joined, parted
 from .surgery import rejoined
 from .wear import Worn, uneven
@@ -47,36 +47,6 @@ class ClosesOverTraced(Exception):
     """What a function closes over is being differentiated or compiled: nobody can look at it."""
 
 
-class _Place(NamedTuple):
-    """What a run goes on from, or what is saved of it.
-
-    Args:
-        surface: to go on, where its neighbours were found.
-        state: points and fields.
-    """
-
-    surface: Discretization
-    state: tuple
-
-
-class _Progress(NamedTuple):
-    """What is on disk.
-
-    Args:
-        part: number of parts done.
-        place: at the end of the last.
-        saved: at the times asked for; those not reached hold anything.
-        counts: steps accepted and refused, and how often neighbours were found anew.
-        changes: of the points: times, and what `Evolution.history` tells of them.
-    """
-
-    part: Any
-    place: _Place
-    saved: list[_Place]
-    counts: Any
-    changes: Any
-
-
 def followed(
     moving: Moving,
     state,
@@ -92,12 +62,12 @@ def followed(
     times, start = np.asarray(times, state[0].dtype), np.asarray(t0, state[0].dtype)
     ends, file = times[-1:], None
     if checkpoint is not None:
-        ends = _ends(start, times[-1], checkpoint.every)
+        ends = ends_of(start, times[-1], checkpoint.every)
         kinds = (adapt, contact)
-        file = _File(checkpoint, _digest(moving, state, start, times, options, kinds, checkpoint))
+        file = File(checkpoint, _digest(moving, state, start, times, options, kinds, checkpoint))
     run = _Run(moving, state, start, options, adapt, contact)
     saved: list = [run.saved] * len(times)
-    now = _Progress(np.array(0), run.place, saved, run.counts, run.changes)
+    now = Progress(np.array(0), run.place, saved, run.counts, run.changes)
     if file is not None:
         now, run.solver = file.read(now, adapt is None)
     if adapt is not None and not now.part:
@@ -115,7 +85,7 @@ def followed(
                 run.to(end if i is None else times[i])
                 if i is not None and not run.gone:
                     saved[i] = run.saved
-            now = _Progress(np.array(part + 1), run.place, saved, run.counts, run.changes)
+            now = Progress(np.array(part + 1), run.place, saved, run.counts, run.changes)
             if run.gone:
                 break
             if file is not None:
@@ -126,31 +96,6 @@ def followed(
     rows = [(place.surface, parted(place.state)[1]) for place in saved[:count]]
     changes = None if adapt is None else np.asarray(now.changes)
     return jnp.asarray(times[:count]), rows, stats, changes
-
-
-class _File(NamedTuple):
-    """A run on disk: its arrays, after each part."""
-
-    checkpoint: Checkpoint
-    key: str
-
-    def read(self, now: _Progress, same_sizes: bool) -> tuple[_Progress, str]:
-        """What is there, and that it is; else what is given."""
-        path = Path(self.checkpoint.path)
-        if not path.exists():
-            return now, ""
-        arrays, others = eqx.partition(now, is_array)
-        arrays = read_back(path, self.key, arrays, same_sizes=same_sizes)
-        return eqx.combine(jax.tree.map(jnp.asarray, arrays), others), "read from disk"
-
-    def write(self, now: _Progress) -> None:
-        written(Path(self.checkpoint.path), self.key, eqx.filter(now, is_array))
-
-
-def _ends(start, end, every: float) -> np.ndarray:
-    """Of the parts; a remainder that is nothing but round-off is none of its own."""
-    count = max(1, int(np.ceil(float(end - start) / every * (1 - 1e-12))))
-    return np.append(start + every * np.arange(1, count), end).astype(end.dtype)
 
 
 def _digest(moving: Moving, state, start, times, options, kinds, checkpoint: Checkpoint) -> str:
@@ -178,7 +123,7 @@ class _Run:
         self.tell: Callable = lambda t: None
         self.watch()
 
-    def goes_on(self, t, now: _Progress) -> None:
+    def goes_on(self, t, now: Progress) -> None:
         """From what is on disk, or would be."""
         self.moving = Moving.of(now.place.surface, self.moving.motion, self.moving.on)
         self.t, self.state, self.search = t, now.place.state, None
@@ -197,13 +142,13 @@ class _Run:
             self.moving = Moving.of(surface, self.moving.motion, self.moving.on, faced)
 
     @property
-    def place(self) -> _Place:
+    def place(self) -> Place:
         surface = self.moving.surface
         plain = Discretization(surface.cloud, surface.neighbors, surface.method, surface.border)
-        return _Place(plain, self.state)
+        return Place(plain, self.state)
 
     @property
-    def saved(self) -> _Place:
+    def saved(self) -> Place:
         surface = self.now()
         if float(self.t) > float(self.start) and (surface is None or self.folds(surface)):
             # Lists or normals have ceased to serve: others may.
@@ -218,7 +163,7 @@ class _Run:
         with self.when():
             surface = surface or self.moving.surface_at(self.state[0])
         fields = self.moving.fields(self.t, self.state, self.options["args"])
-        return _Place(surface, joined(self.state[0], fields))
+        return Place(surface, joined(self.state[0], fields))
 
     def now(self) -> Discretization | None:
         """The surface there, if there is one; what was wrong with it would have been an error."""
@@ -277,7 +222,12 @@ class _Run:
                 raise
             return error.solution, np.asarray(error.time, self.t.dtype), error.state
         assert solution.ts is not None and solution.ys is not None
-        return solution, solution.ts[-1], jax.tree.map(lambda y: y[-1], _seen(solution.ys))
+        last = lambda y: np.asarray(y)[-1]  # which compiles nothing
+        return (
+            solution,
+            last(solution.ts),
+            jax.tree.map(lambda y: on_device(last(y)), _seen(solution.ys)),
+        )
 
     def next_change(self):
         """When points are looked at whatever they have done: at multiples of a time from the start,
@@ -302,8 +252,8 @@ class _Run:
         if self.contact is None or self.free is None:
             return False
         limit = self.free + _PAST * self.contact.distance
-        away = jnp.sum((points - self.moving.surface.cloud.points) ** 2, axis=1)
-        return bool(jnp.any(away > limit**2))
+        from_here = np.asarray(points) - np.asarray(self.moving.surface.cloud.points)
+        return bool(np.any(np.sum(from_here**2, axis=1) > np.asarray(limit) ** 2))
 
     def renew(self) -> None:
         """Normals and neighbours found anew, and points changed."""
@@ -328,7 +278,9 @@ class _Run:
 
     def room(self, surface: Discretization) -> NeighborSearch:
         """To find neighbours in, of points that may come to be denser."""
-        return surface.search() if self.adapt is None else surface.search(margin=_ROOM)
+        margin = 1.25 if self.adapt is None else _ROOM
+        lists = surface.cloud, surface.neighbors, surface.method
+        return NeighborSearch.allocated(*lists, margin, known=True)
 
     def begin(self, surface: Discretization) -> None:
         """On a surface whose lists were found for other points."""

@@ -75,8 +75,9 @@ def checked_times(problem: AbstractEvolution, u0, t0, t1, dt0):
         if value is not None or name != "dt0":
             real(value, name)
     apart = is_concrete(t0, t1) and t0 != t1
-    t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
-    dt0 = None if dt0 is None else jnp.asarray(dt0, dtype)
+    # A conversion by NumPy is compiled by nobody.
+    number = lambda t: jnp.asarray(np.asarray(t, dtype) if is_concrete(t) else t, dtype)
+    t0, t1, dt0 = number(t0), number(t1), None if dt0 is None else number(dt0)
     if not is_concrete(t0, t1):
         return t0, t1, dt0
     start, end = float(t0), float(t1)

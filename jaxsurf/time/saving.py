@@ -8,8 +8,11 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
+from ..compiling import on_device
+from ..failures import is_concrete
 from ..functions import Traced, canonical
 from .problem import AbstractEvolution
 from .states import Norm, root_mean_square
@@ -81,7 +84,10 @@ def ending(event: dfx.Event, problem: AbstractEvolution, now, told: dict) -> dfx
         told: what diffrax tells conditions of the run.
     """
     t0, t1 = told["t0"], told["t1"]
-    direction = jnp.where(t1 < t0, -1, 1).astype(t0.dtype)
+    if is_concrete(t0, t1):
+        direction = on_device(np.where(np.asarray(t1) < np.asarray(t0), -1, 1).astype(t0.dtype))
+    else:
+        direction = jnp.where(t1 < t0, -1, 1).astype(t0.dtype)
 
     def new(condition):
         if isinstance(condition, AbstractCondition):

@@ -35,6 +35,8 @@ from .stencils.stencil import Stencil
 from .stencils.targets import Laplacian
 from .stencils.usual import USUAL
 
+_LAPLACIAN = Laplacian()
+
 
 def choose_neighbors(
     cloud: PointCloud,
@@ -80,7 +82,7 @@ def choose_neighbors(
         needed = np.ones(cloud.n, bool)
     else:
         needed = ~np.asarray(checked_mask(bound, cloud.n, "bound"))
-    neighbors = _adapted(cloud, method, throw, needed)[0]
+    neighbors = weighed_neighbors(cloud, method, throw, needed)[0]
 
     def held(lists: Neighbors) -> Neighbors:
         mask = np.asarray(lists.mask) & needed[:, None]
@@ -94,7 +96,7 @@ def choose_fewer_neighbors(cloud: PointCloud, method: AbstractMethod) -> Neighbo
 
     For surfaces at rest; the Laplacian there is more accurate and has fewer negative weights.
     """
-    return _adapted(cloud, method, True, fewest=0)[0]
+    return weighed_neighbors(cloud, method, fewest=0)[0]
 
 
 def build(cloud, neighbors, method, target, throw) -> Stencil:
@@ -102,15 +104,14 @@ def build(cloud, neighbors, method, target, throw) -> Stencil:
     return build_all(cloud, neighbors, method, target, throw)[0]
 
 
-def build_all(cloud, neighbors, method, target, throw) -> list[Stencil]:
-    """As `build`; of a `Joint` each of its operators."""
+def build_all(cloud, neighbors, method, target, throw, weights=None) -> list[Stencil]:
+    """As `build`; of a `Joint` each of its operators. What `stencil_weights` gives may be known."""
     instance(cloud, PointCloud, "cloud")
     instance(method, AbstractMethod, "method", "GFDM(degree=4) or DCPSE(order=2), say")
     if neighbors is not None:
         neighbors = switched_on(cloud, checked_lists(neighbors))
-    weights = None
     if neighbors is None:
-        neighbors, laplacian = _adapted(cloud, method, throw)
+        neighbors, laplacian = weighed_neighbors(cloud, method, throw)
         if isinstance(target, Laplacian) and is_concrete(cloud):
             weights = laplacian
     _check_sizes(cloud, neighbors, method, target, throw)
@@ -236,26 +237,32 @@ def _weights_of_blocks(blocks, count, method, target):
 # --- neighbourhoods ------------------------------------------------------------------------
 
 
-def _adapted(cloud, method, throw, needed=True, fewest=None):
-    """Neighbours that suit the method, and the Laplacian's weights and diagnostics with them."""
+def weighed_neighbors(cloud, method, throw=True, needed=True, fewest=None, target=_LAPLACIAN):
+    """Neighbours that suit the method, and weights and diagnostics with them.
+
+    Args:
+        needed, fewest: rows that may be adapted, and see `resized`.
+        target: of the weights: the Laplacian, or a `Joint` with it in front.
+    """
     cloud = without_derivatives(cloud)
     needs_values("cloud", cloud, instead="under jit and vmap pass the neighbours")
     with at_once():  # also within something that is traced
-        return _chosen(cloud, method, throw, needed, fewest)
+        return _chosen(cloud, method, throw, needed, fewest, target)
 
 
-def _chosen(cloud, method, throw, needed, fewest):
+def _chosen(cloud, method, throw, needed, fewest, target):
     on = cloud.host_active
     available = int(on.sum())
     count = whole(method.neighbor_count(cloud.dim), f"neighbor_count of {method}", least=1)
     k = min(count, available)
     neighbors = find_neighbors(cloud, k, throw=throw)
-    _check_sizes(cloud, neighbors, method, Laplacian(), throw)
-    found = stencil_weights(cloud, neighbors, method, Laplacian())
+    _check_sizes(cloud, neighbors, method, target, throw)
+    found = stencil_weights(cloud, neighbors, method, target)
     share = np.asarray(dominance(jax.tree.map(np.asarray, found[1])))
     poor = np.flatnonzero(on & needed & (share < method.least_dominance))
     sizes = sizes_to_try(method, cloud.dim, k, available)
-    new, chosen, best = resized(cloud, neighbors, found, method, share, poor, sizes, fewest)
+    rows = share, poor, sizes, fewest
+    new, chosen, best = resized(cloud, neighbors, found, method, *rows, target)
     report(cloud, neighbors, poor, best, chosen, method)
     return new
 
@@ -269,15 +276,17 @@ def resized(
     poor: Int[np.ndarray, " r"],
     sizes: Sequence[int],
     fewest: int | None = None,
+    target: Any = _LAPLACIAN,
 ) -> tuple[tuple[Neighbors, Any], Int[np.ndarray, " r"], Float[np.ndarray, " r"]]:
     """Lists of which some rows are of other sizes, as far as these serve better; on the host.
 
     Args:
-        found: what `stencil_weights` gives of the Laplacian; None if nobody asks for it.
+        found: what `stencil_weights` gives of the target; None if nobody asks for it.
         share: see `dominance`.
         poor: the rows.
         sizes: to try in turn, see `sizes_to_try`.
         fewest: points on a border; as many as there are if None.
+        target: the Laplacian, or a `Joint` with it in front.
 
     Returns:
         The lists, and what was found, with what was found of those rows; sizes and shares of them.
@@ -297,7 +306,7 @@ def resized(
             break
         rows = poor[left]
         some = represented(points, near[left], good[left], size, k)
-        trial = _in_chunks(cloud, *some, method, rows)
+        trial = _in_chunks(cloud, *some, method, target, rows)
         now = np.asarray(dominance(trial[1]))
         wanted = share_wanted(border[rows], share[rows], size, fewest, method)
         better = is_better(now, best[left], wanted, method)
@@ -318,13 +327,13 @@ def resized(
     return (new, known), chosen, best
 
 
-def _in_chunks(cloud, indices, mask, method, rows):
-    """Weights and diagnostics of the Laplacian of some rows, on the host."""
+def _in_chunks(cloud, indices, mask, method, target, rows):
+    """Weights and diagnostics of some rows, on the host."""
     parts = []
     # Filled up with copies, so that few shapes are ever compiled.
     for part in np.resize(np.arange(len(rows)), (-(-len(rows) // TRIED), TRIED)):
         some = Rows(indices[part], mask[part])
-        parts.append(stencil_weights(cloud, some, method, Laplacian(), rows[part]))
+        parts.append(stencil_weights(cloud, some, method, target, rows[part]))
     joined = lambda *a: np.concatenate([np.asarray(b) for b in a], axis=-1)[..., : len(rows)]
     return jax.tree.map(joined, *parts)
 

@@ -12,7 +12,8 @@ from . import curvature, operators, quadrature
 from .arguments import as_float, as_many, finite, instance, switched_off, whole
 from .borders.border import Border
 from .borders.order import marked_border
-from .build import checked_lists, choose_neighbors
+from .build import checked_lists
+from .built import Built, built, weighed
 from .cloud import PointCloud
 from .failures import is_concrete, needs_values, without_derivatives
 from .interpolation import interpolated
@@ -106,9 +107,8 @@ class Discretization(eqx.Module):
         r"""A Laplacian that is symmetric and negative semi-definite in the inner product of masses.
 
         With `cell_areas` m: $m_i w_{ij} = m_j w_{ji} > 0$, $j \ne i$, and rows that sum to zero, on
-        any cloud and to round-off. See `jaxsurf/symmetric.py`. At a border it has the natural
-        condition $\partial_\nu u = 0$. `diagnostics.residual`: how far the moments of its rows
-        are from those of the Laplacian, relative to these.
+        any cloud and to round-off. At a border it has the natural condition $\partial_\nu u = 0$.
+        `diagnostics.residual`: how far moments of its rows are from the Laplacian's, relatively.
 
         Accuracy: solutions of second order on quasi-uniform points (`tests/test_symmetric.py`);
             $L u$ itself is not, see `python -m experiments run symmetric`. Symmetric to round-off
@@ -127,8 +127,9 @@ class Discretization(eqx.Module):
         return symmetrised(self.laplacian, self.cloud, self.neighbors, self.cell_areas, self.border)
 
     @Kept
-    def _built(self) -> operators.Built:
-        return operators.built(self.cloud, self.neighbors, self.method, self._cut_at_once)
+    def _built(self) -> Built:
+        lists, weights = (self.neighbors, self.method), vars(self).pop("_weights", None)
+        return built(self.cloud, *lists, self._cut_at_once, weights=weights)
 
     @property
     def _cut_at_once(self) -> quadrature.Cut | None:
@@ -180,12 +181,11 @@ class Discretization(eqx.Module):
         r"""Relative error to expect of the Laplacian, of fields as smooth as the surface.
 
         $\|\Delta_S x + (d - 1) H n\| / \|(d - 1) H n\|$ over all points: what the Laplacian
-        makes of the positions beside what the gradient makes of the normals. A few per cent: more
-        points.
+        makes of positions beside what the gradient makes of normals. A few per cent: more points.
 
         Accuracy: between a fifth and four times the error of fields that vary as fast, on smooth,
-            coarse and random points (`tests/test_accuracy.py`). Of normals that are wrong it tells
-            too. A plane has none but round-off. In float32 within 1e-5 of it.
+            coarse and random points (`tests/test_accuracy.py`). Wrong normals count too. A plane
+            has none but round-off. In float32 within 1e-5 of it.
         Differentiable: forward and reverse, in points and normals.
 
         Example:
@@ -248,8 +248,7 @@ class Discretization(eqx.Module):
             u: field on the cloud, `(n, *c)`.
             points: where its values are wanted, `(m, d)`.
 
-        Returns:
-            Values `(m, *c)`, of the local polynomial of the cloud's point next to each.
+        Returns: values `(m, *c)`, of the local polynomial of the cloud's point next to each.
 
         Accuracy: error $O(h^{p+1})$ with p as for `areas`.
         Differentiable: forward and reverse, in the field, the points wanted, and the cloud's points
@@ -394,7 +393,8 @@ def discretize(
     """
     instance(cloud, PointCloud, "cloud")
     instance(method, AbstractMethod, "method", "GFDM(degree=4) or DCPSE(order=2), say")
-    if neighbors is None:
-        neighbors = choose_neighbors(cloud, method=method)
-    neighbors = switched_on(cloud, checked_lists(neighbors))
-    return Discretization(cloud, neighbors, method, marked_border(cloud))
+    lists, weights = (neighbors, None) if neighbors is not None else weighed(cloud, method)
+    lists = switched_on(cloud, checked_lists(lists))
+    surface = Discretization(cloud, lists, method, marked_border(cloud))
+    vars(surface)["_weights"] = weights if is_concrete(cloud) else None
+    return surface

@@ -2,7 +2,7 @@ r"""Differential operators on point clouds: on surfaces, and in flat space."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,17 +10,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .arguments import POINTS, as_float, finite, instance, switched_off, whole
-from .build import build, build_all, build_with
+from .build import build
 from .cloud import PointCloud
 from .failures import is_concrete, refuse, without_derivatives
 from .neighbors import Neighbors, find_neighbors
-from .quadrature import Cells, Cut, cells_in_rows
 from .stencils.algebra import Composition
 from .stencils.dcpse import FlatDCPSE
 from .stencils.gathers import take
 from .stencils.method import AbstractMethod
 from .stencils.stencil import Stencil
-from .stencils.targets import Gradient, Hessian, Joint, Laplacian, Partial
+from .stencils.targets import Gradient, Hessian, Laplacian, Partial
 from .stencils.usual import USUAL
 
 
@@ -101,36 +100,6 @@ def surface_gradient(
         True
     """
     return build(cloud, neighbors, method, Gradient(), throw)
-
-
-class Built(NamedTuple):
-    """The Laplacian, and what comes with it for nothing.
-
-    Args:
-        gradient: from the same factorisation of the moment matrices; None if these are not shared.
-        cells: those of integrals, if they were cut in the same program.
-    """
-
-    laplacian: Stencil
-    gradient: Stencil | None = None
-    cells: Cells | None = None
-
-
-def built(cloud, neighbors, method, cut: Cut | None = None, throw: bool = True) -> Built:
-    """As `laplace_beltrami`, and what a method that shares its moments gives with it.
-
-    Args:
-        cut: cells are cut too, of a traced cloud.
-        throw: as there.
-    """
-    if not method.shares_moments:
-        return Built(laplace_beltrami(cloud, neighbors, method=method, throw=throw))
-    both = Joint((Laplacian(), Gradient()))
-    if cut is None:
-        laplacian, gradient = build_all(cloud, neighbors, method, both, throw)
-        return Built(laplacian, gradient)
-    (laplacian, gradient), cells = build_with(cloud, neighbors, method, both, cut)
-    return Built(laplacian, gradient, cells_in_rows(cells, cloud.n))
 
 
 def surface_divergence(

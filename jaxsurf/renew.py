@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Int
 from .adapt import dominance, is_better, represented, share_wanted, sizes_to_try
 from .arguments import instance, real
 from .build import resized, stencil_weights
+from .built import Built, built
 from .cells import all_on
 from .checks import RINGS
 from .cloud import PointCloud
@@ -29,7 +30,6 @@ from .islands import Rings, without_islands
 from .machine import AGAIN, COUNTED, CPU, SHEETS, TRIED, block, machine
 from .nearest import Grid, Nearest, nearest_in
 from .neighbors import Neighbors, Rows, find_neighbors, with_near
-from .operators import Built, built
 from .quadrature import Cut
 from .stencils.method import AbstractMethod
 from .stencils.targets import Laplacian

@@ -133,10 +133,7 @@ class Discretization(eqx.Module):
 
     @property
     def _cut_at_once(self) -> quadrature.Cut | None:
-        """How cells are cut where that is done while the operators are built.
-
-        In compiled code, where what nobody asks for is left out (and under a bare `vmap`).
-        """
+        """How cells are cut with the operators: in compiled code, which drops what nobody wants."""
         compiled = not is_concrete(without_derivatives(self.cloud))
         even = self.neighbors.near is None and self.border is None
         at_once = compiled and even and self.method.shares_moments
@@ -248,7 +245,8 @@ class Discretization(eqx.Module):
             u: field on the cloud, `(n, *c)`.
             points: where its values are wanted, `(m, d)`.
 
-        Returns: values `(m, *c)`, of the local polynomial of the cloud's point next to each.
+        Returns:
+            Values `(m, *c)`, of the local polynomial of the cloud's point next to each.
 
         Accuracy: error $O(h^{p+1})$ with p as for `areas`.
         Differentiable: forward and reverse, in the field, the points wanted, and the cloud's points
@@ -332,11 +330,12 @@ class Discretization(eqx.Module):
     def _renewed(self, cloud: PointCloud, search: NeighborSearch) -> Discretization:
         """The surface of another cloud of the same points, with neighbours of its own."""
         there = Discretization(cloud, self.neighbors, search.method, self.border)
-        neighbors, found, built = renewed(search, cloud, self.neighbors, there._cut_at_once)
+        how = there._cut_at_once, is_judged()
+        neighbors, found, made = renewed(search, cloud, self.neighbors, *how)
         # What has turned no list found anew would hold.
         found = jnp.where(folded(cloud, self.neighbors), 2, found)
         surface = Discretization(cloud, neighbors, search.method, self.border, found=found)
-        vars(surface)["_kept"] = {"_built": built}
+        vars(surface)["_kept"] = {"_built": made}
         return surface
 
     @Kept

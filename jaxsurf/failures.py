@@ -41,6 +41,11 @@ def is_concrete(*trees: Any) -> bool:
     return not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(trees))
 
 
+def is_eager() -> bool:
+    """True if what is computed of known numbers is known: nothing around it is being compiled."""
+    return is_concrete(jnp.asarray(np.zeros(())))
+
+
 def without_derivatives(tree: Any) -> Any:
     """The values that are being differentiated, where they are known: what choices are made by.
 

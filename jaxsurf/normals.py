@@ -208,7 +208,8 @@ def refit_normals(
     whole(batch_size, "batch_size", least=1)
     needed = polynomial_count(points.shape[1] - 1, whole(degree, "degree", least=1))
     _check_fit(neighbors.k, degree, needed)
-    mask = np.asarray(neighbors.mask) if is_concrete(neighbors.mask) else neighbors.mask
+    known = is_concrete(points, normals, neighbors.mask)
+    mask = np.asarray(neighbors.mask) if known else neighbors.mask
     on, count = mask[:, 0], mask.sum(axis=1)
     text = f"point {{i}} has {{v}} neighbours, degree {degree} needs at least {needed}"
     check(count, lambda count, on: on & (count < needed), text, on)

@@ -25,7 +25,7 @@ from .cells import all_on
 from .checks import RINGS
 from .cloud import PointCloud
 from .compiling import in_batches, on_device, sized_jit
-from .failures import is_concrete, unchecked, without_derivatives
+from .failures import is_concrete, is_eager, unchecked, without_derivatives
 from .islands import Rings, without_islands
 from .machine import AGAIN, COUNTED, CPU, SHEETS, TRIED, block, machine
 from .nearest import Grid, Nearest, nearest_in
@@ -135,7 +135,11 @@ def _candidates(grid, reach: int):
 
 
 def renewed(
-    search: NeighborSearch, cloud: PointCloud, before: Neighbors, cut: Cut | None = None
+    search: NeighborSearch,
+    cloud: PointCloud,
+    before: Neighbors,
+    cut: Cut | None = None,
+    throw: bool = False,
 ) -> tuple[Neighbors, Int[Array, " n"], Built]:
     """Lists of a moved cloud, a code for each, and operators that are built with them.
 
@@ -146,12 +150,15 @@ def renewed(
         before: lists of the same points before they moved. They say how far to look; a row without
             room for a new list keeps that one.
         cut: as of `built`.
+        throw: raise what is an error of the host, as points that coincide.
     """
-    if machine() is CPU and is_concrete(without_derivatives((cloud, before))):
+    known = without_derivatives((cloud, before, search.method))
+    if machine() is CPU and cut is None and is_concrete(known) and is_eager():
         try:
-            return _on_host(search, cloud, before, cut)
-        except ValueError:  # which is a code below
-            if not search.tiers:
+            return _on_host(search, cloud, before)
+        except ValueError:
+            # What is not finite has a code, below.
+            if not search.tiers or (throw and np.isfinite(known[0].seen.points).all()):
                 raise
     if not search.tiers:
         raise ValueError("search has no room for points that are not known: see surface.search()")
@@ -165,20 +172,20 @@ def renewed(
         return with_near(usual, near), code, operators
     diagnostics = jax.tree.map(jax.lax.stop_gradient, operators.laplacian.diagnostics)
     adapted, code, changed = _adapted(search, found_by, fixed, before, usual, code, diagnostics)
-    known = without_derivatives(changed)
-    if not is_concrete(known):
+    changed = without_derivatives(changed)
+    if not is_concrete(changed):
         again = lambda: (adapted, built_with(adapted))
         adapted, operators = jax.lax.cond(changed, again, lambda: (usual, operators))
-    elif known:
+    elif changed:
         operators = built_with(adapted)
     return with_near(adapted, near), code, operators
 
 
-def _on_host(search, cloud, before, cut):
+def _on_host(search, cloud, before):
     fixed, method = without_derivatives(cloud), search.method
     lists = find_neighbors(fixed, search.k, throw=False)
     usual = _with_slots(lists, search.slots)
-    built_with = lambda lists: built(cloud, lists, method, cut, throw=False)
+    built_with = lambda lists: built(cloud, lists, method, throw=False)
     operators, code = built_with(usual), on_device(np.zeros(cloud.n, int))
     near = None if before.near is None else usual
     diagnostics = without_derivatives(operators.laplacian.diagnostics)
@@ -258,7 +265,7 @@ def _usual(search, grid) -> tuple[Nearest, Int[Array, " n"]]:
     n = len(grid.order)
     rows = jnp.arange(n, dtype=jnp.int32)
     found = nearest_in(grid, rows, k, reach=reach, count=room)
-    code = jnp.where(found.crowded & grid.on, CROWDED, 0)
+    code = jnp.where(found.crowded & grid.on, CROWDED, 0).astype(int)
 
     def look(rows, state):
         again = nearest_in(grid, rows, k, reach=wider.reach, count=wider.candidates, few=True)
@@ -280,7 +287,7 @@ def _apart(search, grid, rings, found, lists) -> _Lists:
 def _adapted(search, found_by, cloud, before, usual, code, diagnostics):
     """Lists of other sizes where the usual one does not serve, codes, and whether any changed."""
     grid, rings = found_by
-    lists = _Lists(usual.indices.T, usual.mask.T, code)
+    lists = _Lists(usual.indices.T[: search.k], usual.mask.T[: search.k], code)
     share = dominance(diagnostics)
     border = jnp.zeros(cloud.n, bool) if cloud.boundary is None else cloud.boundary
     most = max(search.sizes)

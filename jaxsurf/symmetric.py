@@ -182,7 +182,7 @@ def symmetrised(
     return eqx.tree_at(parts, operator, (left, None), is_leaf=none)
 
 
-@jax.jit
+@sized_jit
 def _per_mass(weights, masses):
     return with_center((weights / jnp.where(masses > 0, masses, 1))[None])[0]
 
@@ -196,15 +196,24 @@ def positive_weights(cloud, neighbors, masses, flux):
         flux: conormals times the length of border at each point, `(n, d)`; None without border.
     """
     pairs = Pairs.of(cloud, neighbors, masses, flux)
-    mu = _multipliers(jax.lax.stop_gradient(pairs))
-    # Zero, with the derivative of what moves the solution.
-    rest = pairs.rest(mu)
-    rest = rest - jax.lax.stop_gradient(rest)
-    exact = functools.partial(jax.lax.custom_linear_solve, symmetric=True)
-    mu = mu - pairs.solved(mu, rest, _tolerance(rest), exact)
+    mu = _implied(pairs, _multipliers(jax.lax.stop_gradient(pairs)))
     s = pairs.kernel * _positive(pairs.forces(mu))[0]
     left = jnp.max(jnp.abs(pairs.moments(s) - pairs.wanted), axis=0) / (2 * pairs.unit)
     return s, jax.lax.stop_gradient(left)
+
+
+@jax.custom_jvp
+def _implied(pairs: Pairs, mu):
+    """The multipliers as a function of the pairs: where nothing is left of the conditions."""
+    return mu
+
+
+@_implied.defjvp
+def _implied_jvp(primals, tangents):
+    (pairs, mu), (change, _) = primals, tangents
+    rest = jax.jvp(lambda pairs: pairs.rest(mu), (pairs,), (change,))[1]
+    exact = functools.partial(jax.lax.custom_linear_solve, symmetric=True)
+    return mu, -pairs.solved(mu, rest, _tolerance(rest), exact)
 
 
 def _tolerance(values) -> float:

@@ -107,6 +107,10 @@ def test_what_functions_close_over_is_differentiated_too():
     closed = lambda a, **given: end(js.Motion(lambda *s: a * outward(*s)), **STEPS, **given)[0, 0]
     for f in (factor, closed):
         np.testing.assert_allclose(jax.value_and_grad(f)(1.0), [1.1, 0.1], rtol=1e-9)
+        np.testing.assert_allclose(jax.jit(f)(1.0), 1.1, rtol=1e-9)
+        np.testing.assert_allclose(jax.vmap(f)(jnp.array([1.0, 2.0])), [1.1, 1.2], rtol=1e-9)
+    constant = jax.jit(lambda b: b * closed(1.0))
+    np.testing.assert_allclose(constant(2.0), 2.2, rtol=1e-9)
     with pytest.raises(ValueError, match="adapt needs concrete arrays"):
         jax.grad(lambda a: closed(a, adapt=js.Adaptation(0.16)))(1.0)
 

@@ -47,6 +47,16 @@ def carried(motion, cloud):
     return js.PointCloud(points, normals, boundary=cloud.boundary, active=cloud.active)
 
 
+def taken(motion, cloud):
+    """The same; rows that are off have no position."""
+    there, on = carried(motion, cloud), cloud.active
+    if on is None:
+        return there
+    points = jnp.where(on[:, None], there.points, jnp.nan)
+    normals = jnp.where(on[:, None], there.normals, cloud.normals)
+    return js.PointCloud(points, normals, active=on)
+
+
 @functools.partial(jax.jit, static_argnums=2)
 def found(surface, cloud, search):
     moved = surface.moved(cloud.points, cloud.normals, search=search)
@@ -90,13 +100,7 @@ def test_lists_sizes_and_operators_of_the_host(moving):
     cloud, motions = moving
     surface, search = js.discretize(cloud, js.find_neighbors(cloud, 36), method=METHOD), room()
     for i, motion in enumerate(motions):
-        there = carried(motion, cloud)
-        if cloud.active is not None:
-            there = js.PointCloud(
-                jnp.where(cloud.active[:, None], there.points, jnp.nan),
-                jnp.where(cloud.active[:, None], there.normals, cloud.normals),
-                active=cloud.active,
-            )
+        there = taken(motion, cloud)
         with count_compilations() as names:
             moved, laplacian, code = found(surface, there, search)
         assert not (i and names), names
@@ -109,6 +113,60 @@ def test_lists_sizes_and_operators_of_the_host(moving):
         given = np.asarray(laplacian.weights)[:, on]
         np.testing.assert_allclose(given[:width], wanted, atol=1e-11 * np.abs(wanted).max())
         assert not given[width:].any()
+
+
+def test_known_points_are_searched_by_a_tree(moving):
+    """With the lists, operators and codes of compiled code, and nothing to compile for it."""
+    cloud, motions = moving
+    surface, search = js.discretize(cloud, js.find_neighbors(cloud, 36), method=METHOD), room()
+    for i, motion in enumerate(motions):
+        there = taken(motion, cloud)
+        with count_compilations() as names:
+            known = surface.moved(there.points, there.normals, search=search)
+            jax.block_until_ready((known.laplacian.weights, known.code))
+        assert not (i and names), names
+        assert "usual_lists" not in names and "_adapted" not in names
+        moved, laplacian, code = found(surface, there, search)
+        assert lists(known.neighbors) == lists(moved.neighbors) and not known.code.any()
+        np.testing.assert_allclose(
+            known.laplacian.weights,
+            laplacian.weights,
+            atol=1e-11 * jnp.abs(laplacian.weights).max(),
+        )
+        for one, other in zip(jax.tree.leaves((known, known.code)), jax.tree.leaves((moved, code))):
+            assert jax.typeof(one) == jax.typeof(other)  # neither compiles users' programs anew
+
+
+def test_constants_are_searched_in_the_program_that_they_are_in():
+    cloud = jittered_sphere(600)
+    surface = js.discretize(cloud, js.find_neighbors(cloud, 36), method=METHOD)
+    search, x, normals = room(), 1.1 * surface.cloud.points, surface.cloud.normals
+    moved = lambda u: surface.moved(x, normals, search=search).laplacian(u)
+    u = x[:, 0] * x[:, 1]
+    np.testing.assert_allclose(jax.jit(moved)(u), moved(u), atol=1e-10)
+
+
+def test_points_that_coincide_are_named():
+    cloud = jittered_sphere(600)
+    surface = js.discretize(cloud, js.find_neighbors(cloud, 36), method=METHOD)
+    x = surface.cloud.points
+    with pytest.raises(ValueError, match="points 5 and 6 coincide"):
+        surface.moved(x.at[5].set(x[6]), search=room())
+    with pytest.raises(ValueError, match="points is not finite at point 3"):
+        surface.moved(x.at[3].set(jnp.nan), search=room())
+
+
+def test_lists_may_have_more_slots_than_are_filled():
+    cloud = random_sphere(600)
+    surface = js.discretize(cloud, js.find_neighbors(cloud, 45), method=METHOD)
+    search = surface.search(margin=3)
+    assert search.slots == 45 > search.k
+    there = taken(functools.partial(smooth, seed=0, size=0.05), cloud)
+    moved, _, code = found(surface, there, search)
+    known = surface.moved(there.points, there.normals, search=search)
+    assert not code.any() and lists(moved.neighbors) == lists(known.neighbors)
+    near = js.find_neighbors(there, search.k, throw=False)
+    assert lists(near) != lists(known.neighbors)  # some are adapted
 
 
 def toes(m=10, gap=2.4, thick=1.6):

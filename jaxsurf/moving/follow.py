@@ -222,12 +222,9 @@ class _Run:
                 raise
             return error.solution, np.asarray(error.time, self.t.dtype), error.state
         assert solution.ts is not None and solution.ys is not None
+        ts, ys = _seen((solution.ts, solution.ys))
         last = lambda y: np.asarray(y)[-1]  # which compiles nothing
-        return (
-            solution,
-            last(solution.ts),
-            jax.tree.map(lambda y: on_device(last(y)), _seen(solution.ys)),
-        )
+        return solution, last(ts), jax.tree.map(lambda y: on_device(last(y)), ys)
 
     def next_change(self):
         """When points are looked at whatever they have done: at multiples of a time from the start,

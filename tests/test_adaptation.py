@@ -286,8 +286,9 @@ def test_a_corner_has_no_gap_and_no_fold(turn, distance, radius, spacing, degree
     half = np.arccos([(d**2 + a**2 - b**2) / (2 * d * a) for a, b in ((r, s), (s, r))])
     area = np.array([r, s]) ** 2 @ (np.pi - half + np.sin(half) * np.cos(half))
     assert run.events["joined"][0] == 1
-    # What is rounded off grows with the square of the distance of contact.
-    assert abs(run.history["volume"][-1] - area) < 1.5 * spacing**2 * area
+    # What is rounded off grows with the square of the distance of contact. The last bits of the
+    # points decide how often a corner is: of the second 1.2, 1.3 or 1.6 times as much.
+    assert abs(run.history["volume"][-1] - area) < 2 * spacing**2 * area
 
 
 @pytest.mark.slow

@@ -196,9 +196,9 @@ class _Run:
             self.solver = stats["solver"]
             left = reached - self.t > _LEAST * (target - self.t)
             if left and (
-                np.any(unreached(start, new[0], neighbors))
+                np.asarray(unreached(start, new[0], neighbors)).any()
                 or self.may_cross(new[0])
-                or (adapts and np.any(uneven(start, new[0], neighbors, times=2)))
+                or (adapts and np.asarray(uneven(start, new[0], neighbors, times=2)).any())
             ):
                 # The last step went farther than the neighbours serve: half of the way first.
                 end = self.t + (reached - self.t) / 2

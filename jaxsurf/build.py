@@ -110,7 +110,7 @@ def build_all(cloud, neighbors, method, target, throw, weights=None) -> list[Ste
     instance(method, AbstractMethod, "method", "GFDM(degree=4) or DCPSE(order=2), say")
     if neighbors is not None:
         neighbors = switched_on(cloud, checked_lists(neighbors))
-    if neighbors is None:
+    else:
         neighbors, laplacian = weighed_neighbors(cloud, method, throw)
         if isinstance(target, Laplacian) and is_concrete(cloud):
             weights = laplacian
@@ -258,13 +258,17 @@ def _chosen(cloud, method, throw, needed, fewest, target):
     neighbors = find_neighbors(cloud, k, throw=throw)
     _check_sizes(cloud, neighbors, method, target, throw)
     found = stencil_weights(cloud, neighbors, method, target)
-    share = np.asarray(dominance(jax.tree.map(np.asarray, found[1])))
-    poor = np.flatnonzero(on & needed & (share < method.least_dominance))
+    share, poor = poorly_served(cloud, found[1], method, needed)
     sizes = sizes_to_try(method, cloud.dim, k, available)
-    rows = share, poor, sizes, fewest
-    new, chosen, best = resized(cloud, neighbors, found, method, *rows, target)
+    new, chosen, best = resized(cloud, neighbors, found, method, share, poor, sizes, fewest, target)
     report(cloud, neighbors, poor, best, chosen, method)
     return new
+
+
+def poorly_served(cloud, diagnostics, method, needed=True):
+    """Shares of the centres, see `dominance`, and the rows where a method asks for more."""
+    share = np.asarray(dominance(jax.tree.map(np.asarray, diagnostics)))
+    return share, np.flatnonzero(cloud.host_active & needed & (share < method.least_dominance))
 
 
 def resized(

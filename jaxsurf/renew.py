@@ -1,8 +1,9 @@
-"""Neighbours found anew in compiled code, and adapted: what `choose_neighbors` does, for motion.
+"""Neighbours found anew, and adapted, also in compiled code: `choose_neighbors` for motion.
 
-All shapes are fixed beforehand, on the host (`NeighborSearch`). Most rows are searched at once,
-within the distance that most need; those that need more, hold points of another sheet or have no
-dominant centre are taken out, some at a time, for as long as there are any.
+Known points of a CPU are searched on the host. In compiled code all shapes are fixed beforehand
+(`NeighborSearch`). Most rows are searched at once, within the distance that most need; those that
+need more, hold points of another sheet or have no dominant centre are taken out, some at a time,
+for as long as there are any.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from jaxtyping import Array, Bool, Int
 
 from .adapt import dominance, is_better, represented, share_wanted, sizes_to_try
 from .arguments import instance, real
-from .build import resized, stencil_weights
+from .build import poorly_served, resized, stencil_weights
 from .built import Built, built
 from .cells import all_on
 from .checks import RINGS
@@ -189,8 +190,7 @@ def _on_host(search, cloud, before):
     operators, code = built_with(usual), on_device(np.zeros(cloud.n, int))
     near = None if before.near is None else usual
     diagnostics = without_derivatives(operators.laplacian.diagnostics)
-    share = np.asarray(dominance(jax.tree.map(np.asarray, diagnostics)))
-    poor = np.flatnonzero(fixed.host_active & (share < method.least_dominance))
+    share, poor = poorly_served(fixed, diagnostics, method)
     (adapted, _), size, _ = resized(fixed, lists, None, method, share, poor, search.sizes)
     if (size == search.k).all():
         return with_near(usual, near), code, operators

@@ -96,19 +96,25 @@ def moving(request):
     return cloud, [functools.partial(smooth, seed=s, size=0.1) for s in (0, 1)]
 
 
-def test_lists_sizes_and_operators_of_the_host(moving):
+def moves(moving, move):
+    """What a move makes of a surface, and compiles (from the second on nothing), and `found`."""
     cloud, motions = moving
     surface, search = js.discretize(cloud, js.find_neighbors(cloud, 36), method=METHOD), room()
     for i, motion in enumerate(motions):
         there = taken(motion, cloud)
         with count_compilations() as names:
-            moved, laplacian, code = found(surface, there, search)
+            made = jax.block_until_ready(move(surface, there, search))
         assert not (i and names), names
+        yield there, made, names, functools.partial(found, surface, there, search)
+
+
+def test_lists_sizes_and_operators_of_the_host(moving):
+    for there, (moved, laplacian, code), *_ in moves(moving, found):
         anew = js.choose_neighbors(there, method=METHOD)
         assert lists(moved.neighbors) == lists(anew)
         assert not code.any()
         expected = js.laplace_beltrami(there, anew, method=METHOD, throw=False)
-        on = np.ones(cloud.n, bool) if cloud.active is None else np.asarray(cloud.active)
+        on = there.host_active
         wanted, width = np.asarray(expected.weights)[:, on], anew.k
         given = np.asarray(laplacian.weights)[:, on]
         np.testing.assert_allclose(given[:width], wanted, atol=1e-11 * np.abs(wanted).max())
@@ -117,24 +123,15 @@ def test_lists_sizes_and_operators_of_the_host(moving):
 
 def test_known_points_are_searched_by_a_tree(moving):
     """With the lists, operators and codes of compiled code, and nothing to compile for it."""
-    cloud, motions = moving
-    surface, search = js.discretize(cloud, js.find_neighbors(cloud, 36), method=METHOD), room()
-    for i, motion in enumerate(motions):
-        there = taken(motion, cloud)
-        with count_compilations() as names:
-            known = surface.moved(there.points, there.normals, search=search)
-            jax.block_until_ready((known.laplacian.weights, known.code))
-        assert not (i and names), names
+    for _, made, names, again in moves(moving, found.__wrapped__):
+        compiled = again()
         assert "usual_lists" not in names and "_adapted" not in names
-        moved, laplacian, code = found(surface, there, search)
-        assert lists(known.neighbors) == lists(moved.neighbors) and not known.code.any()
-        np.testing.assert_allclose(
-            known.laplacian.weights,
-            laplacian.weights,
-            atol=1e-11 * jnp.abs(laplacian.weights).max(),
-        )
-        for one, other in zip(jax.tree.leaves((known, known.code)), jax.tree.leaves((moved, code))):
+        for one, other in zip(jax.tree.leaves(made), jax.tree.leaves(compiled)):
             assert jax.typeof(one) == jax.typeof(other)  # neither compiles users' programs anew
+        (known, laplacian, code), (moved, expected, _) = made, compiled
+        assert lists(known.neighbors) == lists(moved.neighbors) and not code.any()
+        size = jnp.abs(expected.weights).max()
+        np.testing.assert_allclose(laplacian.weights, expected.weights, atol=1e-11 * size)
 
 
 def test_constants_are_searched_in_the_program_that_they_are_in():

@@ -84,8 +84,8 @@ def in_space(method: js.GFDM | js.DCPSE, order: int, sizes: list[int]) -> list[R
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    numbers = [4, 8] if quick else [8, 16]
-    rows = in_time(2, 300, numbers) + in_time(4, 300, [8, 16])
+    n, numbers = (200, [4, 8]) if quick else (300, [8, 16])
+    rows = in_time(2, n, numbers) + in_time(4, n, [8, 16])
     rows += in_space(js.GFDM(degree=4), 4, [700, 1_400] if quick else [1_000, 2_000, 4_000])
     if not quick:
         rows += in_space(js.GFDM(degree=2), 2, [1_000, 2_000, 4_000])

@@ -113,7 +113,7 @@ def collapse(n: int, times) -> tuple[js.Evolution, float]:
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    n, times = (6_000, [0.0, 0.12]) if quick else (_POINTS, [0.0, 0.24, 0.48, 0.72, 0.96, 1.2])
+    n, times = (3_500, [0.0, 0.12]) if quick else (_POINTS, [0.0, 0.24, 0.48, 0.72, 0.96, 1.2])
     solution, distance = collapse(n, times)
     events, end = solution.events, solution.surfaces[-1]
     setting = {"n": n, "t": times[-1], "contact distance": distance}

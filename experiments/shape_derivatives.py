@@ -148,7 +148,7 @@ def _apart(found: tuple, wanted: tuple) -> tuple[float, float]:
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    sizes = (500, 1_000) if quick else (2_500, 10_000)
+    sizes = (300, 600) if quick else (2_500, 10_000)
     names = ["ellipsoid"] if quick else list(CASES)
     keys = {"area", "volume", "compliance"} if quick else None
     rows, drawn = [], {}

@@ -43,7 +43,7 @@ def predicted(n: int, method: js.DCPSE | js.GFDM, last: float) -> float:
 
 def run(quick: bool, out: Path) -> list[Row]:
     fine, other = js.DCPSE(order=4), js.GFDM(degree=4)
-    cases: list[tuple[int, js.DCPSE | js.GFDM]] = [(500 if quick else 1_000, fine)]
+    cases: list[tuple[int, js.DCPSE | js.GFDM]] = [(350 if quick else 1_000, fine)]
     if not quick:
         cases += [(2_000, fine), (2_000, other), (4_000, fine)]
     rows: list[Row] = []

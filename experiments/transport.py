@@ -69,7 +69,7 @@ def turned(cloud: js.PointCloud, method, turns: int) -> np.ndarray:
 def run(quick: bool, out: Path) -> list[Row]:
     # One turn at every size, many at one of them.
     sizes, long, turns = (
-        ([2_000, 4_000], 2_000, 5) if quick else ([1_500, 3_000, 6_000], 3_000, 100)
+        ([1_000, 2_000], 1_000, 5) if quick else ([1_500, 3_000, 6_000], 3_000, 100)
     )
     orders = {js.DCPSE(order=4): 4} if quick else {js.DCPSE(order=4): 4, js.DCPSE(order=2): 2}
     figure, axes = plt.subplots(1, 4, figsize=(17, 4), layout="constrained")

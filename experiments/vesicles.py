@@ -115,7 +115,7 @@ def _picture(path: Path, found: dict, exact: dict[str, Profile], branches: dict)
 
 
 def run(quick: bool, out: Path) -> list[Row]:
-    n, steps = (800, 40) if quick else (1_500, 200)
+    n, steps = (500, 40) if quick else (1_500, 200)
     names = ["prolate"] if quick else list(_SHAPES)
     starts = [spheroid for *_, spheroid in _SHAPES.values()]
     branches = {name: branch(0.6, start) for name, start in zip(_SHAPES, starts)}

@@ -18,15 +18,11 @@ from .helpers import (
 
 def error(cloud, method):
     u, gradient, laplacian = exponential(cloud.points)
-    neighbors = js.choose_neighbors(cloud, method=method)
-    operators = [
-        make(cloud, neighbors, method=method)
-        for make in (js.laplace_beltrami, js.surface_gradient, js.surface_divergence)
-    ]
+    surface = js.discretize(cloud, method=method)
     return [
-        relative_error(operators[0](u), laplacian),
-        relative_error(operators[1](u), gradient),
-        relative_error(operators[2](gradient), laplacian),
+        relative_error(surface.laplacian(u), laplacian),
+        relative_error(surface.gradient(u), gradient),
+        relative_error(surface.divergence(gradient), laplacian),
     ]
 
 

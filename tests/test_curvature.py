@@ -16,15 +16,14 @@ def torus_curvature(points, big=3.0):
 @pytest.mark.parametrize("method", METHODS, ids=label)
 def test_torus(method):
     cloud = js.torus(6000, 3.0, 1.0)
-    neighbors = js.choose_neighbors(cloud, method=method)
+    surface = js.discretize(cloud, method=method)
     mean, gauss = torus_curvature(cloud.points)
     bound = {"DCPSE2": 8e-3, "DCPSE4": 1.5e-4, "GFDM2": 6e-3, "GFDM4": 2e-4, "RBFFD4": 2e-4}[
         label(method)
     ]
-    args = dict(neighbors=neighbors, method=method)
-    assert relative_error(js.mean_curvature(cloud, **args), mean) < bound
-    assert relative_error(js.gauss_curvature(cloud, **args), gauss) < 2 * bound
-    curvatures, directions = js.principal_curvatures(cloud, **args)
+    assert relative_error(surface.mean_curvature, mean) < bound
+    assert relative_error(surface.gauss_curvature, gauss) < 2 * bound
+    curvatures, directions = surface.principal_curvatures
     assert relative_error(curvatures, jnp.stack([gauss, jnp.ones(cloud.n)], axis=1)) < bound
     np.testing.assert_allclose(
         jnp.cross(directions[:, 0], directions[:, 1]), cloud.normals, atol=1e-9
@@ -33,11 +32,11 @@ def test_torus(method):
     around = jnp.stack([-cloud.points[:, 1], cloud.points[:, 0], 0 * mean], axis=1)
     around /= jnp.linalg.norm(around, axis=1, keepdims=True)
     assert jnp.abs(jnp.abs(jnp.sum(around * directions[:, 0], axis=1)) - 1).max() < 10 * bound
-    vector = js.mean_curvature_vector(cloud, **args)
+    vector = js.mean_curvature_vector(cloud, surface.neighbors, method=method)
     # Twice the mean curvature by the Laplacian, which of RBF-FD is less accurate than the gradient.
     times = 10 if isinstance(method, js.RBFFD) else 3
     assert relative_error(vector, -2 * mean[:, None] * cloud.normals) < times * bound
-    tensor = js.shape_tensor(cloud, **args)
+    tensor = surface.shape_tensor
     np.testing.assert_allclose(jnp.einsum("nab,nb->na", tensor, cloud.normals), 0, atol=1e-12)
 
 

@@ -38,10 +38,8 @@ def test_operators_in_points_and_normals(method):
     neighbors = js.choose_neighbors(CLOUD, method=method)
 
     def total(points):
-        cloud = cloud_of(points)
-        laplacian = js.laplace_beltrami(cloud, neighbors, method=method)
-        divergence = js.surface_divergence(cloud, neighbors, method=method)
-        return smooth(laplacian(FIELD)) + smooth(divergence(VECTOR))
+        surface = js.Discretization(cloud_of(points), neighbors, method)
+        return smooth(surface.laplacian(FIELD)) + smooth(surface.divergence(VECTOR))
 
     check_derivative(total, CLOUD.points * jnp.array([1.0, 1.2, 1.5]), step=1e-4)
 

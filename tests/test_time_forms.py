@@ -9,7 +9,7 @@ import scipy.linalg
 
 import jaxsurf as js
 
-from .helpers import check_derivatives, relative_error
+from .helpers import check_derivatives, operations, relative_error
 from .test_solve_forms import single
 
 pytestmark = pytest.mark.slow
@@ -265,3 +265,24 @@ def test_upwinding_mapped_and_in_single_precision():
         alone = jax.jit(lambda v: damped(circle, lists, v, u))(turn)
         assert alone.dtype == jnp.float32
     np.testing.assert_allclose(alone, found[0], atol=2e-4 * size)
+
+
+@pytest.mark.parametrize(
+    "solver, places",
+    [
+        (js.RKC2(), 1),
+        (js.IMEX(order=3), 1),
+        # Newton's residual is another.
+        (js.SDIRK(order=3), 2),
+        # So are steps of given length, which are looked at.
+        (js.AdamsBashforth2(), 2),
+    ],
+    ids=lambda x: type(x).__name__,
+)
+def test_a_rate_stands_once_in_the_program(solver, places):
+    """It may take seconds to compile."""
+    problem = js.AdvectionDiffusionReaction(LAPLACIAN, reaction=lambda t, u, args: jax.lax.erf(u))
+    given = dict(dt0=0.01) if isinstance(solver, js.AdamsBashforth2) else {}
+    run = lambda u: js.integrate(problem, u, t1=0.1, solver=solver, **given).ys
+    program = jax.make_jaxpr(run)(WAVE).jaxpr
+    assert sum(op.primitive.name == "erf" for op in operations(program)) == places

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from .states import after_jump, dtype_of
+from .states import dtype_of
 
 
 class _State(NamedTuple):
@@ -61,25 +61,31 @@ class AdamsBashforth2(dfx.AbstractSolver):
         return terms.vf(t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args):
-        rate = terms.vf(t0, y0, args)
-        return _State(rate, rate, jnp.zeros((), dtype_of(y0)))
+        # The first step finds it, where all others do.
+        none = jax.tree.map(jnp.zeros_like, y0)
+        return _State(none, none, jnp.zeros((), dtype_of(y0)))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        rate = after_jump(made_jump, solver_state.rate, lambda: terms.vf(t0, y0, args))
-        span, length = terms.contr(t0, t1), jnp.asarray(t1 - t0, solver_state.length.dtype)
-        moved = lambda rate: jax.tree.map(jnp.add, y0, terms.prod(rate, span))
-        ahead = moved(rate)
+        """One loop, in which a rate stands once: after a jump it is found at the start, and ahead
+        by a step of Euler's, with which it is averaged; and at the end at all times."""
+        length = jnp.asarray(t1 - t0, solver_state.length.dtype)
         first = jnp.asarray(made_jump) | (solver_state.length == 0)
+        span = terms.contr(t0, t1)
+        ratio = jnp.where(first, -0.5, length / jnp.where(first, 1, solver_state.length) / 2)
 
-        def start():
-            after = terms.vf(t1, ahead, args)
-            return jax.tree.map(lambda a, b: (a + b) / 2, rate, after)
+        def turn(carry, i):
+            rate, other, _, _ = carry
+            extrapolate = jnp.where(i == 2, ratio, 0)
+            slope = jax.tree.map(lambda a, b: a + extrapolate * (a - b), rate, other)
+            step = terms.prod(slope, span)
+            y = jax.tree.map(lambda y, k: jnp.where(i == 0, y, y + k), y0, step)
+            kept = lambda: jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), rate, other)
+            found = lambda: terms.vf(jnp.where(i == 0, t0, t1), y, args)
+            new = jax.lax.cond(first | (i == 2), found, kept)
+            put = lambda at, old: jax.tree.map(lambda a, b: jnp.where(i == at, a, b), new, old)
+            return (put(0, rate), put(1, other), y, new), None
 
-        def extrapolated():
-            ratio = length / jnp.where(first, 1, solver_state.length) / 2
-            return jax.tree.map(lambda a, b: a + ratio * (a - b), rate, solver_state.before)
-
-        y1 = moved(jax.lax.cond(first, start, extrapolated))
-        after = terms.vf(t1, y1, args)
+        start = (solver_state.rate, solver_state.before, y0, solver_state.rate)
+        (rate, _, y1, after), _ = jax.lax.scan(turn, start, jnp.arange(3))
         dense = dict(y0=y0, y1=y1, k0=terms.prod(rate, span), k1=terms.prod(after, span))
         return y1, None, dense, _State(after, rate, length), dfx.RESULTS.successful

@@ -3,7 +3,7 @@ r"""Implicit Runge–Kutta steps without matrices: every linear system by a Kryl
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-from jaxtyping import Array, ArrayLike, PyTree
+from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from ..arguments import instance, real, whole
 from ..functions import numbers_as_arrays
 from .phases import frozen_at
 from .relative import relative, tolerance_of
-from .states import added, after_jump, dtype_of, root_mean_square
+from .states import added, dtype_of, root_mean_square
 
 Preconditioner = Callable[[Any], lx.AbstractLinearOperator]
 
@@ -185,10 +185,10 @@ class IMEX(_Implicit):
         return added(*(term.vf(t0, y0, args) for term in terms.terms))
 
     def init(self, terms, t0, t1, y0, args):
-        return tuple(term.vf(t0, y0, args) for term in terms.terms)
+        return _State.before(y0, 2)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        terms, solver_state = frozen_at(terms, t0, y0, solver_state)
+        terms, rates = frozen_at(terms, t0, y0, solver_state.rates)
         implicit = terms.terms[1]
         span = implicit.contr(t0, t1)
         solver = relative(self.solver, self.tolerance, y0)
@@ -208,7 +208,8 @@ class IMEX(_Implicit):
             return y, dfx.RESULTS.promote(found.result)
 
         both = tuple(terms.terms)
-        return _steps(tableau, both, solve, (t0, t1), y0, args, solver_state, made_jump)
+        state = _State(rates, solver_state.known)
+        return _steps(tableau, both, solve, (t0, t1), y0, args, state, made_jump)
 
 
 class SDIRK(_Implicit):
@@ -267,7 +268,7 @@ class SDIRK(_Implicit):
         return terms.vf(t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args):
-        return (terms.vf(t0, y0, args),)
+        return _State.before(y0, 1)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         span = terms.contr(t0, t1)
@@ -289,19 +290,25 @@ class SDIRK(_Implicit):
                 target = tolerance * jnp.maximum(root_mean_square(start), root_mean_square(known))
 
                 def unfinished(carry):
-                    _, r, count = carry
-                    return (root_mean_square(r) > target) & (count < self.newton_steps)
+                    _, size, count = carry
+                    return (size > target) & (count <= self.newton_steps)
 
                 def improve(carry):
-                    y, r, count = carry
-                    slope = lx.FunctionLinearOperator(jax.linearize(residual, y)[1], structure)
-                    step = lx.linear_solve(slope, r, inner, options=options, throw=False).value
-                    y = jax.tree.map(jnp.subtract, y, step)
-                    return y, residual(y), count + 1
+                    y, _, count = carry
+                    r, slope = jax.linearize(residual, y)
+                    size = root_mean_square(r)
 
-                carry = (start, residual(start), 0)
-                y, r, _ = jax.lax.while_loop(unfinished, improve, carry)
-                return y, (root_mean_square(r) <= target).astype(root_mean_square(r).dtype)
+                    def improved():
+                        matrix = lx.FunctionLinearOperator(slope, structure)
+                        step = lx.linear_solve(matrix, r, inner, options=options, throw=False)
+                        return jax.tree.map(jnp.subtract, y, step.value)
+
+                    further = (size > target) & (count < self.newton_steps)
+                    return jax.lax.cond(further, improved, lambda: y), size, count + 1
+
+                carry = (start, jnp.full_like(target, jnp.inf), 0)
+                y, size, _ = jax.lax.while_loop(unfinished, improve, carry)
+                return y, (size <= target).astype(size.dtype)
 
             def tangent(slope, vector):
                 operator = lx.FunctionLinearOperator(slope, structure)
@@ -330,59 +337,75 @@ def _options(preconditioner: Preconditioner | None, shift, y0) -> dict:
 _FORCING = 1e-2
 
 
-def _steps(tableau: Tableau, terms, solve, times, y0, args, rates, made_jump):
+class _State(NamedTuple):
+    """What one step hands to the next.
+
+    Args:
+        rates: of the terms at the current state; of none before the first step.
+        known: whether they are.
+    """
+
+    rates: tuple[PyTree[Array], ...]
+    known: Bool[Array, ""]
+
+    @classmethod
+    def before(cls, y0: PyTree[Array], terms: int) -> _State:
+        """The first step, of so many terms."""
+        return cls((jax.tree.map(jnp.zeros_like, y0),) * terms, jnp.asarray(False))
+
+
+def _steps(tableau: Tableau, terms, solve, times, y0, args, state: _State, made_jump):
     """All stages of one step, for one term (implicit) or two (explicit, implicit).
 
-    A loop over stages, not one after the other in the program: it compiles faster.
+    One loop, in which a solve and the rates after it, which take seconds to compile, stand once.
+    Its first turn finds the rates at the start where they are not known, its last those at the end.
 
     Args:
         solve: (t, r, start) -> y with y - γ Δt f(t, y) = r, and its result code.
-        rates: the terms at the start of the step, from the step before.
-        made_jump: True if they jump there.
+        state: of the step before.
+        made_jump: True if rates jump at the start.
     """
     t0, t1 = times
-    rates = after_jump(made_jump, rates, lambda: tuple(term.vf(t0, y0, args) for term in terms))
+    fresh = jnp.asarray(made_jump) | ~state.known
     span = [term.contr(t0, t1) for term in terms]
-    matrices = (tableau.explicit, tableau.implicit)[-len(terms) :]
-    first = [term.prod(rate, s) for term, rate, s in zip(terms, rates, span)]
-    count = len(tableau.nodes)
+    count, real = len(tableau.nodes), dtype_of(y0)
+    matrices = zip((tableau.explicit, tableau.implicit), tableau.weights)
+    rows = (
+        jnp.arange(count + 1),
+        jnp.asarray(np.append(tableau.nodes, 1.0), real),
+        [jnp.asarray(np.vstack(pair), real) for pair in [*matrices][-len(terms) :]],
+    )
+    fine = dfx.RESULTS.where(jnp.asarray(True), *[dfx.RESULTS.successful] * 2)
     # Increments, term by term and stage by stage.
-    room = jax.tree.map(lambda k: jnp.zeros((count, *k.shape), k.dtype).at[0].set(k), first)
+    room = [jax.tree.map(lambda y: jnp.zeros((count, *y.shape), y.dtype), y0) for _ in terms]
 
-    def stage(carry, row):
-        y, room, ok = carry
+    def turn(carry, row):
+        y, rates, room, ok = carry
         i, node, weights = row
-        known = y0
+        known, t = y0, t0 + node * (t1 - t0)
         for w, increments in zip(weights, room):
             known = _combined(known, w, increments)
-        t = t0 + node * (t1 - t0)
-        y, result = solve(t, known, y)
+        is_stage = (i > 0) & (i < count)
+        y, result = jax.lax.cond(is_stage, solve, lambda t, known, _: (known, fine), t, known, y)
         ok = dfx.RESULTS.where(ok == dfx.RESULTS.successful, result, ok)
-        new = [term.vf_prod(t, y, args, s) for term, s in zip(terms, span)]
-        room = jax.tree.map(lambda r, k: r.at[i].set(k), room, new)
-        return (y, room, ok), None
+        found = lambda: tuple(term.vf(t, y, args) for term in terms)
+        rates = jax.lax.cond(fresh | (i > 0), found, lambda: rates)
+        new = [term.prod(rate, s) for term, rate, s in zip(terms, rates, span)]
+        # Those at the end have no room.
+        room = jax.tree.map(lambda r, k: r.at[i].set(k, mode="drop"), room, new)
+        return (y, rates, room, ok), None
 
-    real = dtype_of(y0)
-    rows = (
-        jnp.arange(1, count),
-        jnp.asarray(tableau.nodes[1:], real),
-        [jnp.asarray(matrix[1:], real) for matrix in matrices],
-    )
-    fine = dfx.RESULTS.successful
-    start = (y0, room, dfx.RESULTS.where(jnp.asarray(True), fine, fine))
-    (_, room, ok), _ = jax.lax.scan(stage, start, rows)
+    (y1, rates, room, ok), _ = jax.lax.scan(turn, (y0, state.rates, room, fine), rows)
     total = added(*room)
-    y1 = y0
-    for weights, increments in zip(tableau.weights[-len(terms) :], room):
-        y1 = _combined(y1, jnp.asarray(weights, real), increments)
     zero = jax.tree.map(jnp.zeros_like, y0)
     error = _combined(zero, jnp.asarray(tableau.errors, real), total)
     # Nothing of a step whose equations were not solved is to be kept.
-    error = jax.tree.map(lambda e: jnp.where(ok == fine, e, jnp.inf), error)
-    y1 = jax.tree.map(lambda y: jnp.where(ok == fine, y, jnp.nan), y1)
-    rates = tuple(term.vf(t1, y1, args) for term in terms)
+    solved = ok == dfx.RESULTS.successful
+    error = jax.tree.map(lambda e: jnp.where(solved, e, jnp.inf), error)
+    y1 = jax.tree.map(lambda y: jnp.where(solved, y, jnp.nan), y1)
+    k0 = jax.tree.map(lambda k: k[0], total)
     k1 = added(*(term.prod(rate, s) for term, rate, s in zip(terms, rates, span)))
-    return y1, error, dict(y0=y0, y1=y1, k0=added(*first), k1=k1), rates, ok
+    return y1, error, dict(y0=y0, y1=y1, k0=k0, k1=k1), _State(rates, solved), ok
 
 
 def _combined(y: PyTree[Array], weights: Array, increments: PyTree[Array]) -> PyTree[Array]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,13 +26,6 @@ def root_mean_square(y: PyTree[Array]) -> Float[Array, ""]:
 def added(*trees: PyTree[Array]) -> PyTree[Array]:
     """The sum of states, or of rates."""
     return jax.tree.map(lambda first, *others: sum(others, first), *trees)
-
-
-def after_jump(made_jump, rate: PyTree[Array], fresh: Callable[[], PyTree[Array]]):
-    """The rate at the start of a step: that at the end of the one before, but after a jump."""
-    if made_jump is False:  # known when the program is made
-        return rate
-    return jax.lax.cond(jnp.asarray(made_jump), fresh, lambda: rate)
 
 
 def only_on(active: Bool[Array | np.ndarray, " n"] | None, tree: PyTree) -> PyTree:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 
-from .compiling import copying_jit, namespace, sized_jit
+from .compiling import host_jit, namespace, sized_jit
 from .fits.moments import blockwise, in_blocks, out_of_blocks
 from .fits.plane import Neighborhood
 from .stencils.gathers import take
@@ -41,7 +41,7 @@ def _in_blocks_jvp(primals, tangents):
     return eqx.filter_jvp(read_before, primals, tangents)
 
 
-@copying_jit
+@host_jit
 def blocks_of(cloud, neighbors, rows, size: int):
     """Positions and normals of the neighbours of some rows, mask, radius and border, in blocks."""
     return _read(*_columns_and_lists(cloud, neighbors, rows, size))
@@ -66,7 +66,7 @@ def _read(columns, lists):
     return points, normals, *others
 
 
-@copying_jit
+@host_jit
 def rows_of(weights, others, count: int):
     """Weights, with the slots first, and what else was found of the rows, out of their blocks."""
     weights, others = jax.tree.map(lambda a: out_of_blocks(a, count), (weights, others))

@@ -23,6 +23,7 @@ import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int, Real
 
 from .arguments import as_float, as_many, count_on, real, switched_off, whole
+from .compiling import host_jit, namespace
 from .conditions import Condition
 from .failures import check, is_concrete, raise_at
 from .stencils.algebra import AbstractOperator
@@ -52,6 +53,16 @@ class Source(eqx.Module):
 
 
 _Given = tuple[Array, Array, Array, Array]
+
+
+@host_jit
+def marks(n: int, rows) -> Bool[Array | np.ndarray, " n"]:
+    """True at these of n rows."""
+    if namespace(rows) is np:
+        marked = np.zeros(n, bool)
+        marked[rows] = True
+        return marked
+    return jnp.zeros(n, bool).at[rows].set(True)
 
 
 class Closure(eqx.Module):
@@ -117,7 +128,7 @@ class Closure(eqx.Module):
     @property
     def bound(self) -> Bool[Array, " n"]:
         """True at bound points."""
-        return jnp.zeros(self.n, bool).at[self.rows].set(True)
+        return marks(self.n, self.rows)
 
     def __call__(self, u: Real[Array, "n *c"], t=0.0) -> Float[Array, "n *c"]:
         """The field with its bound values replaced by those that follow at time t.

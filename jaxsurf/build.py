@@ -15,7 +15,7 @@ from .adapt import residual_tolerance as residual_tolerance
 from .arguments import as_many, instance, whole
 from .blocks import blocks_of, of_each, rows_of
 from .cloud import PointCloud
-from .compiling import Pieces, at_once, copying_jit, is_quick, namespace, on_device
+from .compiling import Pieces, at_once, host_jit, is_quick, namespace, on_device
 from .cores import calls_library, divided, side_by_side
 from .failures import (
     is_concrete,
@@ -216,14 +216,14 @@ def _runs_alone(method, target, kind: tuple, make_blocks) -> bool:
     return _KINDS[kind]
 
 
-@copying_jit
+@host_jit
 def _joined(parts, count: int):
     """Parts side by side."""
     xp = namespace(parts[0][0])
     return jax.tree.map(lambda *a: xp.concatenate(a, axis=-1)[..., :count], *parts)
 
 
-@copying_jit
+@host_jit
 def _slots_first(indices):
     return indices.T
 
@@ -388,6 +388,6 @@ def determined(weights, residual, degree: int):
     return refuse(weights, _undetermined(residual), text, residual)
 
 
-@copying_jit
+@host_jit
 def _undetermined(residual):
     return ~(residual < residual_tolerance(residual.dtype))

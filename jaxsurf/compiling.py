@@ -194,21 +194,32 @@ def on_device(a: AnyArray) -> jax.Array:
         return jax.device_put(a)
 
 
-def copying_jit(f: Callable) -> Callable:
-    """`sized_jit` for a function that copies only: small arrays are left to NumPy, uncompiled.
+def host_jit(f: Callable) -> Callable:
+    """`sized_jit` for a function that does little: small arrays are left to NumPy, uncompiled.
 
-    It is written for both kinds of arrays, see `namespace`. (What it returns is on the device.)
+    It is written for both kinds of arrays, see `namespace`. What it returns is on the device, or,
+    for another of these, NumPy's.
     """
     compiled = sized_jit(f)
 
     @functools.wraps(f)
     def call(*args):
-        if _takes_longer_to_compile(jax.tree.leaves(args)):
-            found = f(*jax.tree.map(lambda a: np.asarray(a) if is_array(a) else a, args))
-            return jax.tree.map(jax.device_put, found)
-        return compiled(*args)
+        if _on_host.get():
+            return f(*args)
+        if not _takes_longer_to_compile(jax.tree.leaves(args)):
+            return compiled(*args)
+        token = _on_host.set(True)
+        try:
+            with np.errstate(all="ignore"):  # as compiled code
+                found = f(*jax.tree.map(lambda a: np.asarray(a) if is_array(a) else a, args))
+        finally:
+            _on_host.reset(token)
+        return jax.tree.map(jax.device_put, found)
 
     return call
+
+
+_on_host = contextvars.ContextVar("on_host", default=False)
 
 
 def block_by_block(function: Callable, dtype, *, rows: int = 4_096) -> Callable:

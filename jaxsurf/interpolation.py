@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from .blocks import blocks_of, rows_of
 from .build import determined
 from .cloud import PointCloud
-from .compiling import Pieces, copying_jit, in_batches, namespace, on_device
+from .compiling import Pieces, host_jit, in_batches, namespace, on_device
 from .failures import is_concrete, refuse
 from .fits.moments import blockwise, in_blocks, moment_solve
 from .fits.monomials import monomials
@@ -98,7 +98,7 @@ def _interpolation_weights(
     return slots, *rows_of(*_of_blocks((blocks, at), degree), len(points))
 
 
-@copying_jit
+@host_jit
 def _seen_from(cloud, neighbors, points, centers):
     """Neighbours of the centres, slots first; their lists; ways to the points, in blocks."""
     lists = Rows(neighbors.indices[centers], neighbors.mask[centers], neighbors.radius)
@@ -118,7 +118,7 @@ def _of_blocks(blocks, count, degree: int):
     return blockwise(weights, blocks, count)
 
 
-@copying_jit
+@host_jit
 def distance_and_reach(cloud, neighbors, points, centers):
     """How far points are from those of the cloud next to them, and how far these's lists reach."""
     x, points = constant((cloud.points, points))
@@ -128,13 +128,13 @@ def distance_and_reach(cloud, neighbors, points, centers):
     return xp.sqrt(squared(points - center)), xp.sqrt(xp.max(away, axis=0))
 
 
-@copying_jit
+@host_jit
 def beyond(distance, reach):
     """Whether something is farther than it may be, or no number."""
     return ~(distance <= reach)
 
 
-@copying_jit
+@host_jit
 def _summed(weights, slots, u):
     if namespace(weights) is np:
         columns = np.moveaxis(u, 0, -1)

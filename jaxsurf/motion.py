@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import contextvars
+import functools
 from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .arguments import count_on, finite, switched_off
+from .arguments import finite, switched_off
 from .build import residual_tolerance
 from .cloud import PointCloud
-from .compiling import sized_jit
+from .compiling import host_jit, namespace, sized_jit
 from .failures import raise_at
 from .frames import frames_of
 from .neighbors import first_ring
@@ -79,31 +80,36 @@ def carried(gradient, normals, before, after):
     on, dim = gradient.active, normals.shape[1]
     normals = switched_off(on, normals, np.eye(dim)[0])
     tangents = frames_of(normals)[:, :-1]
-    middle = lambda x: jnp.sum(switched_off(on, x), axis=0) / count_on(on, len(x))
-    images = [
-        jnp.einsum("nxs,nts->ntx", gradient(x - middle(x)), tangents) for x in (before, after)
-    ]
+    # Far from the origin round-off would be of the size of the way there.
+    at = 0 if on is None else jnp.argmax(on)
+    points = jnp.stack([x - jax.lax.stop_gradient(x[at]) for x in (before, after)], axis=1)
+    along = lambda a, b: jnp.sum(a * b, axis=-1)
+    images = along(gradient(switched_off(on, points))[:, :, None], tangents[:, None, :, None])
     # A switched-off point stays as it is.
-    images = [switched_off(on, image, tangents) for image in images]
-    a = jnp.einsum("ntx,nux->ntu", images[0], tangents)
-    s = jnp.einsum("ntx,nx->nt", images[0], normals)
+    image, new = (switched_off(on, images[:, i], tangents) for i in (0, 1))
+    a = along(image[:, :, None], tangents[:, None])
+    s = along(image, normals[:, None])
+    # The normal of the tangents $A^{-1} (t - s n)$ there is linear in n.
+    if dim == 2:
+        size = a[:, 0, 0]
+        lean = lambda n: -s * crossed(n[:, None])
+    else:
+        size = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
+        axis = s[:, :1] * new[:, 1] - s[:, 1:] * new[:, 0]
+        lean = lambda n: jnp.cross(axis, n)
+    upright = crossed(new)
+
     # Where nothing moves they stay as they are, however large that error is.
-    ahead = normals
-    for _ in range(_TURNS):
-        normal = crossed(_solved(a, images[1] - s[:, :, None] * ahead[:, None]))
+    def turn(normal, length):
+        ahead = normal * (length if dim == 2 else jnp.sqrt(length))[:, None]
+        normal = (upright + lean(ahead)) / size[:, None]
         length = jnp.sqrt(jnp.sum(normal**2, axis=1))
-        normal = normal / jnp.where(length > 0, length, 1)[:, None]
-        ahead = normal * (length ** (1 / (normals.shape[1] - 1)))[:, None]
+        return normal / jnp.where(length > 0, length, 1)[:, None], length
+
+    normal, length = normals, jnp.ones_like(normals[:, 0])
+    for _ in range(_TURNS):
+        normal, length = turn(normal, length)
     return normal, length
-
-
-def _solved(a, b):
-    """Solutions of the 1 x 1 or 2 x 2 systems of all points."""
-    if a.shape[1] == 1:
-        return b / a
-    (p, q), (r, s) = jnp.moveaxis(a, 0, -1)
-    inverse = jnp.stack([jnp.stack([s, -q]), jnp.stack([-r, p])]) / (p * s - q * r)
-    return jnp.einsum("tun,nux->ntx", inverse, b)
 
 
 def crossed(tangents):
@@ -113,61 +119,70 @@ def crossed(tangents):
     return jnp.cross(tangents[:, 0], tangents[:, 1])
 
 
-@sized_jit
+@host_jit
 def judged(cloud, neighbors, residual):
     """Codes of points: not finite, folded, degenerate."""
-    ill = ~jnp.all(jnp.isfinite(cloud.points) & jnp.isfinite(cloud.normals), axis=1)
+    xp = namespace(residual)
+    ill = ~xp.all(xp.isfinite(cloud.points) & xp.isfinite(cloud.normals), axis=1)
     poor = ~(residual < residual_tolerance(residual.dtype))
-    code = jnp.where(ill, 1, jnp.where(folded(cloud, neighbors), 2, jnp.where(poor, 3, 0)))
-    return jnp.where(neighbors.mask[:, 0], code, 0)
+    code = xp.where(ill, 1, xp.where(folded(cloud, neighbors), 2, xp.where(poor, 3, 0)))
+    return xp.where(neighbors.mask[:, 0], code, 0)
 
 
-@sized_jit
+@host_jit
 def folded(cloud, neighbors):
     """Whether the normal of a neighbour next to a point points to the other side."""
-    points, normals = cloud.points, cloud.normals
+    normals, xp = cloud.normals, namespace(cloud.normals)
 
     def opposite(found, slot):
         index, used = slot
-        return found | (used & (jnp.sum(normals[index] * normals, axis=1) < 0)), None
+        return found | (used & (xp.sum(normals[index] * normals, axis=1) < 0))
 
     # Of those farther away, other lists would leave out what has turned.
-    ring = first_ring(neighbors, points.shape[1])
-    lists = (ring.indices.T, ring.mask.T)
-    return jax.lax.scan(opposite, jnp.zeros(len(points), bool), lists)[0]
+    ring = first_ring(neighbors, cloud.points.shape[1])
+    return _over_slots(opposite, xp.zeros(len(normals), bool), ring)
 
 
-@sized_jit
+def _over_slots(f: Callable, start, lists):
+    """What is left of a start after all slots of the lists, one after another."""
+    slots = (lists.indices.T, lists.mask.T)
+    if namespace(lists.mask) is np:
+        return functools.reduce(f, zip(*slots), start)
+    return jax.lax.scan(lambda found, slot: (f(found, slot), None), start, slots)[0]
+
+
+@host_jit
 def unreached(before, after, neighbors, share=_SKIN):
     """Whether points outside a list may have come nearer than a share of the way to its farthest.
 
     They were at least as far as the farthest of the list. They came nearer by no other factor
     than those that are nearly as far, if the motion is smooth.
     """
-    slots = (neighbors.indices.T, neighbors.mask.T)
+    xp = namespace(after)
 
     def distances(slot):
         index, used = slot
         return tuple(
-            jnp.where(used, jnp.sqrt(jnp.sum((x[index] - x) ** 2, axis=1)), 0)
+            xp.where(used, xp.sqrt(xp.sum((x[index] - x) ** 2, axis=-1)), 0)
             for x in (before, after)
         )
 
-    old, new = jax.lax.map(distances, slots)
-    farthest = jnp.max(old, axis=0)
+    slots = (neighbors.indices.T, neighbors.mask.T)
+    old, new = distances(slots) if xp is np else jax.lax.map(distances, slots)
+    farthest = xp.max(old, axis=0)
     outer = (old > 0.5 * farthest) & (old > 0)
-    stretch = jnp.min(jnp.where(outer, new / jnp.where(outer, old, 1), jnp.inf), axis=0)
-    return stretch * farthest < share * jnp.max(new, axis=0)
+    stretch = xp.min(xp.where(outer, new / xp.where(outer, old, 1), xp.inf), axis=0)
+    return stretch * farthest < share * xp.max(new, axis=0)
 
 
-@sized_jit
+@host_jit
 def code_of(cloud, neighbors, found_at, found, residual):
     """Codes of points, also of lists that no longer reach and of what was found with these."""
-    code = judged(cloud, neighbors, residual)
+    xp, code = namespace(residual), judged(cloud, neighbors, residual)
     if found_at is not None:
-        code = jnp.where((code == 0) & unreached(found_at, cloud.points, neighbors), 4, code)
+        code = xp.where((code == 0) & unreached(found_at, cloud.points, neighbors), 4, code)
     if found is not None:
-        code = jnp.where((found > 0) & ((code == 0) | (code > 2)), found, code)
+        code = xp.where((found > 0) & ((code == 0) | (code > 2)), found, code)
     return code
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,10 +12,10 @@ from jaxtyping import Array, Float
 from .arguments import as_many, instance, shaped
 from .borders.border import Border, checked_border
 from .borders.order import find_border, inward
-from .boundary import Closure, Source, check_pivots
+from .boundary import Closure, Source, check_pivots, marks
 from .build import residual_tolerance, stencil_weights
 from .cloud import PointCloud
-from .compiling import at_once, copying_jit, namespace, on_device, sized_jit
+from .compiling import at_once, host_jit, namespace, on_device, sized_jit
 from .conditions import Condition, checked_conditions
 from .discretization import Discretization
 from .failures import is_concrete, needs_values, raise_at, refuse
@@ -102,24 +101,26 @@ def eliminate(
         rows, m = condition.where[own], int(own.sum())
         if condition.a is None or not m:  # free
             continue
-        a = jnp.broadcast_to(condition.a, condition.m)[own].astype(dtype)
+        pick = np.flatnonzero(own)
+        a = _picked(condition.a, condition.m, pick, dtype)
         if condition.b is None:
-            pivot, slots, weights = a, np.zeros((0, m), np.int32), jnp.zeros((0, m), dtype)
+            pivot, slots, weights = a, np.zeros((0, m), np.int32), np.zeros((0, m), dtype)
         else:
-            b = jnp.broadcast_to(condition.b, condition.m)[own].astype(dtype)
+            b = _picked(condition.b, condition.m, pick, dtype)
             nu = _conormals(cloud, condition, rows, own, border)
             near = _free_neighbors(cloud, rows, free, neighbors, method)
             others = free if of_surface else None
             near, w, residual = _outward_derivative(cloud, near, rows, nu, method, others)
             if throw:
                 w = _checked(w, rows, near, residual, method, cloud.dim)
-            pivot, slots, weights = a + b * w[0], np.asarray(near.indices).T[1:], -b * w[1:]
+            pivot, weights = _resolved(a, b, w)
+            slots = np.asarray(near.indices).T[1:]
             if throw and is_concrete(w, a, b):
                 size = np.abs(a) + np.abs(b) * np.abs(w).sum(axis=0)
                 check_pivots(pivot, size, rows, "value at point {i}: a + b w_i")
-        parts.append((rows, slots, weights / pivot))
-        place, pick = on_device(np.arange(start, start + m)), on_device(np.flatnonzero(own))
-        sources.append(Source(place, 1 / pivot, pick, condition))
+        parts.append((rows, slots, weights))
+        place = on_device(np.arange(start, start + m))
+        sources.append(Source(place, _inverse(pivot), on_device(pick), condition))
         start += m
     rows, indices, weights = stacked(parts, int(np.argmax(free)), dtype)
     return Closure(cloud.n, rows, indices, weights, tuple(sources), on_device(declared))
@@ -178,22 +179,36 @@ def without_flux(surface: Discretization) -> Closure | None:
     return Closure(cloud.n, rows, slots, _shares(w), (), bound)
 
 
-@copying_jit
+@host_jit
 def _without_bound(neighbors: Neighbors, rows):
     """Lists of some rows without the others of these, slots of other points, the rows as a mask."""
     slots = neighbors.indices[rows]
-    if namespace(rows) is np:
-        bound: Any = np.zeros(neighbors.n, bool)
-        bound[rows] = True
-    else:
-        bound = jnp.zeros(neighbors.n, bool).at[rows].set(True)
+    bound = marks(neighbors.n, rows)
     near = Rows(slots, neighbors.mask[rows] & (~bound[slots] | (slots == rows[:, None])), None)
     return near, slots.T[1:], bound
 
 
-@copying_jit
+@host_jit
 def _shares(w):
     return -w[1:] / w[0]
+
+
+@host_jit
+def _picked(coefficient, m: int, pick, dtype):
+    """That of some of the points of a condition, which has one for each of them or for all."""
+    return namespace(pick).broadcast_to(coefficient, m)[pick].astype(dtype)
+
+
+@host_jit
+def _resolved(a, b, w):
+    """What the value is multiplied by in a u + b w·u, and then the other values in its place."""
+    pivot = a + b * w[0]
+    return pivot, -b * w[1:] / pivot
+
+
+@host_jit
+def _inverse(pivot):
+    return 1 / pivot
 
 
 # Weights of one sign begin to take over where the curvature times the reach of a stencil is this,
@@ -271,15 +286,21 @@ def stacked(parts, free: int, dtype):
 
     Who refers to whom is concrete in traced code too, where `solve` has to know it.
     """
-    nothing = (np.zeros(0, np.int32), np.zeros((0, 0), np.int32), jnp.zeros((0, 0), dtype))
+    nothing = (np.zeros(0, np.int32), np.zeros((0, 0), np.int32), np.zeros((0, 0), dtype))
     parts = parts or [nothing]
     k = max(len(slots) for _, slots, _ in parts)
     padding = lambda x: ((0, k - len(x)), (0, 0))
     rows = np.concatenate([rows for rows, _, _ in parts])
     indices = [np.pad(s, padding(s), constant_values=free) for _, s, _ in parts]
-    weights = [jnp.pad(w, padding(w)) for _, _, w in parts]
     table = np.concatenate(indices, axis=1)
-    return on_device(rows), on_device(table), jnp.concatenate(weights, axis=1)
+    return on_device(rows), on_device(table), _side_by_side([w for *_, w in parts], k)
+
+
+@host_jit
+def _side_by_side(weights: list, k: int):
+    numbers = namespace(weights[0])
+    filled = [numbers.pad(w, ((0, k - len(w)), (0, 0))) for w in weights]
+    return numbers.concatenate(filled, axis=1)
 
 
 def _conormals(cloud, condition, rows, own, border) -> Float[Array, "m d"]:

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float
 from .blocks import blocks_of, rows_of
 from .build import determined
 from .cloud import PointCloud
-from .compiling import Pieces, copying_jit, kept, namespace, sized_jit, stored
+from .compiling import Pieces, host_jit, kept, namespace, sized_jit, stored
 from .failures import is_concrete, refuse, warn
 from .fits.graph import Graph
 from .fits.moments import blockwise, in_blocks, moment_solve
@@ -171,7 +171,7 @@ def cell_areas(cells: Cells, neighbors: Neighbors) -> Float[Array, " n"]:
     return refuse(sizes, bad, "the cell of point {i} has the area {v}", sizes)
 
 
-@copying_jit
+@host_jit
 def _completed(sizes, closed, neighbors):
     """With the mean of the neighbours in place of what is not closed; where there is none."""
     xp = namespace(sizes)
@@ -184,13 +184,13 @@ def _completed(sizes, closed, neighbors):
     return sizes, on & ~(sizes > 0)
 
 
-@copying_jit
+@host_jit
 def _open(closed, mask):
     """Whether cells are not closed, and out of how many neighbours."""
     return ~closed, mask.sum(axis=1)
 
 
-@copying_jit
+@host_jit
 def _summed(weights, indices):
     n, slots = weights.shape[1], indices.T
     if namespace(weights) is np:

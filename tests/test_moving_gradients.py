@@ -66,7 +66,7 @@ def test_across_points_added():
     $u = r^{-2} e^{-6 D \int r^{-2}} x y / r^2$ in the points of the start: an integral of $u^2$ is
     known as a function of a, and so is its derivative.
     """
-    surface, adaptation = js.discretize(js.sphere(250), method=METHOD), js.Adaptation(0.21)
+    surface = js.discretize(js.sphere(400), method=js.GFDM(degree=3))
     motion = js.Motion(lambda t, surface, fields, args: args * surface.cloud.normals)
     x, y, _ = surface.cloud.points.T
     go_on = lambda rate, surface, u, t0: js.evolve(
@@ -75,8 +75,8 @@ def test_across_points_added():
     at, shorter = jnp.asarray(0.3), STEPS | dict(dt0=0.025)
     first = go_on(at, surface, x * y, 0.0)
     half = first.surfaces[-1]
-    filled = js.adapt_points(half, adaptation).surface
-    assert filled.n > surface.n + 30
+    filled = js.adapt_points(half, js.Adaptation(0.17)).surface
+    assert filled.n > surface.n + 50
 
     def energy(rate):
         run = go_on(rate, surface, x * y, 0.0)

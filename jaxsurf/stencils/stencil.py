@@ -17,6 +17,7 @@ import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
 from ..arguments import instance, is_array, per_point, shaped, switched_off
+from ..compiling import host_jit, namespace
 from ..failures import check, is_concrete, unchecked
 from ..indices import mask, point_indices
 from .algebra import AbstractOperator, Transposed
@@ -247,11 +248,12 @@ def _counts(count) -> str:
     return f"{low}" if low == high else f"{low} to {high}"
 
 
-@jax.jit
+@host_jit
 def _diagonal(weights, indices):
-    own = indices == jnp.arange(indices.shape[1], dtype=indices.dtype)
+    xp = namespace(weights)
+    own = indices == xp.arange(indices.shape[1], dtype=indices.dtype)
     own = own.reshape(len(own), *[1] * (weights.ndim - 2), -1)
-    return jnp.sum(jnp.where(own, weights, 0), axis=0)
+    return xp.sum(xp.where(own, weights, 0), axis=0)
 
 
 def prepared(operator: AbstractOperator) -> AbstractOperator:

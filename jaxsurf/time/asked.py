@@ -14,6 +14,7 @@ from jaxtyping import Array, PyTree
 
 from ..arguments import as_float, real, within_round_off
 from ..boundary import check_border
+from ..compiling import AnyArray, namespace
 from ..failures import check, is_concrete, not_finite, raise_at
 from .higher import WaveEquation
 from .problem import AbstractEvolution
@@ -23,9 +24,9 @@ from .states import dtype_of, only_on
 _RESOLVED = 4
 
 
-def resolved(t0: Array, t1: Array) -> Array:
+def resolved(t0: AnyArray, t1: AnyArray) -> AnyArray:
     """A step that is not lost in the times of a run."""
-    return _RESOLVED * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    return _RESOLVED * jnp.finfo(t0.dtype).eps * namespace(t0).maximum(abs(t0), abs(t1))
 
 
 def checked_state(problem: AbstractEvolution, u0: Any) -> PyTree[Array]:

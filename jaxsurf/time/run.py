@@ -13,7 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, PyTree
 
 from ..arguments import instance, real, whole, within_round_off
-from ..compiling import sized_filter_jit, without_full_collections
+from ..compiling import AnyArray, host_jit, namespace, sized_filter_jit, without_full_collections
 from ..failures import is_concrete, is_marking, warn
 from ..functions import Traced, canonical, constant, numbers_as_arrays
 from .amplification import AbstractAmplification, amplification_of
@@ -352,19 +352,19 @@ def _looped(solver: RKC2, adjoint: dfx.AbstractAdjoint) -> RKC2:
     return RKC2(solver.spectral_radius, solver.max_stages, loop)
 
 
-@jax.jit
-def _limit(u0, growth, t0: Array, t1: Array) -> Array:
+@host_jit
+def _limit(u0, growth, t0: AnyArray, t1: AnyArray) -> AnyArray:
     """Size beyond which a state is none of the problem's."""
-    size = root_mean_square(u0)
+    xp, size = namespace(t0), root_mean_square(u0)
     # (Infinite times nothing would be no number.)
-    grown = jnp.where(jnp.isfinite(growth), jnp.exp(growth * jnp.abs(t1 - t0)), jnp.inf)
-    return jnp.where(size > 0, GROWN * size * grown, jnp.where(jnp.isfinite(grown), 0, jnp.inf))
+    grown = xp.where(xp.isfinite(growth), xp.exp(growth * abs(t1 - t0)), xp.inf)
+    return xp.where(size > 0, GROWN * size * grown, xp.where(xp.isfinite(grown), 0, xp.inf))
 
 
-@jax.jit
-def _shortest(t0: Array, t1: Array) -> Array:
+@host_jit
+def _shortest(t0: AnyArray, t1: AnyArray) -> AnyArray:
     """A step that is not worth trying: much shorter than all, or lost in the time."""
-    return jnp.maximum(_SHORTEST * jnp.abs(t1 - t0), resolved(t0, t1))
+    return namespace(t0).maximum(_SHORTEST * abs(t1 - t0), resolved(t0, t1))
 
 
 def _clipped(controller: dfx.AbstractStepSizeController) -> dfx.AbstractStepSizeController:

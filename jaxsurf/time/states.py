@@ -9,16 +9,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..arguments import count_on, switched_off
+from ..compiling import AnyArray, host_jit, namespace
 from ..failures import is_concrete, warn
 
 
-@jax.jit
-def length(y: PyTree[Array]) -> Float[Array, ""]:
+@host_jit
+def length(y: PyTree[AnyArray]) -> Float[AnyArray, ""]:
     """Euclidean norm of all entries."""
-    return jnp.sqrt(sum(jnp.sum(leaf * leaf) for leaf in jax.tree.leaves(y)))
+    leaves = jax.tree.leaves(y)
+    return namespace(leaves[0]).sqrt(sum((leaf * leaf).sum() for leaf in leaves))
 
 
-def root_mean_square(y: PyTree[Array]) -> Float[Array, ""]:
+@host_jit
+def root_mean_square(y: PyTree[AnyArray]) -> Float[AnyArray, ""]:
     """Of all entries."""
     return length(y) / max(sum(leaf.size for leaf in jax.tree.leaves(y)), 1) ** 0.5
 

@@ -174,7 +174,7 @@ class AdvectionDiffusionReaction(AbstractEvolution):
             return
         if isinstance(self.laplacian, Stencil) and is_concrete(self.laplacian.weights):
             with at_once():  # also within something that is traced
-                mean = float(jnp.mean(self.laplacian.diagonal))
+                mean = float(np.mean(np.asarray(self.laplacian.diagonal)))
             if mean > 0:
                 raise ValueError(
                     f"the diagonal of `laplacian` has the mean {mean:.3g}, expected one below 0: "

@@ -29,7 +29,10 @@ def as_float(x: Any, name: str = "array", *shapes: tuple) -> Float[Array, "..."]
         ValueError: another shape.
     """
     if not isinstance(x, jax.Array):
-        x = jnp.asarray(_real_numbers(x, name))
+        x = _real_numbers(x, name)
+        kind = x.dtype if jnp.issubdtype(x.dtype, jnp.floating) else jnp.result_type(float)
+        with jax.core.eval_context():  # a copy, where `jnp.asarray` compiles one for every shape
+            x = jax.device_put(np.asarray(x, kind))
     if jnp.issubdtype(x.dtype, jnp.complexfloating):
         raise TypeError(f"{name} is complex ({x.dtype}), expected real numbers")
     x = shaped(x, name, *shapes)

@@ -24,7 +24,7 @@ from .machine import CPU, PIECE, QUICK, QUICKEST, machine
 if TYPE_CHECKING:
     AnyArray = Any  # the kind that goes in comes out
 else:
-    AnyArray = jax.Array | np.ndarray
+    AnyArray = jax.Array | np.ndarray | np.generic
 
 # What is computed within is computed at once, also while something else is traced. (JAX's
 # `ensure_compile_time_eval` would take apart the programs called in it as well, and compile what

@@ -216,7 +216,7 @@ def refit_normals(
     radius = neighbors.radius
     if radius is not None:
         radius = jnp.broadcast_to(jnp.asarray(radius, points.dtype), n)
-    some = None if is_concrete(on) and np.all(on) else on
+    some = None if is_concrete(on) and np.asarray(on).all() else on
     given, points = normals, switched_off(some, points)
     normals = switched_off(some, given, np.eye(points.shape[1])[0])
     lists = neighbors.indices, neighbors.mask, radius

@@ -111,7 +111,7 @@ def cells_of(cloud: PointCloud, neighbors: Neighbors, method: AbstractMethod, bo
         return cells_in_rows(_cells_of_blocks((blocks, lines), cut), cloud.n)
 
     cells = by(cut)
-    if is_concrete(cells.closed) and not np.all(cells.closed) and cut.sides < neighbors.k:
+    if is_concrete(cells.closed) and not np.asarray(cells.closed).all() and cut.sides < neighbors.k:
         return by(Cut(cut.degree, neighbors.k))
     return cells
 
@@ -161,7 +161,7 @@ def cell_areas(cells: Cells, neighbors: Neighbors) -> Float[Array, " n"]:
     Where neighbours do not close a cell, as at folds of a scan, the mean of theirs, with a warning.
     """
     closed = cells.closed
-    if is_concrete(closed) and not np.all(closed):
+    if is_concrete(closed) and not np.asarray(closed).all():
         warn(
             f"the cells of {int((~closed).sum())} points, the first {int(jnp.argmin(closed))}, "
             "are not closed by their neighbours and are given the mean area of theirs: is a "

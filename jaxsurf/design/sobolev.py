@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from ..arguments import instance, real, switched_off
 from ..boundary import Closure
+from ..compiling import host_jit
 from ..conditions import Where, dirichlet, free
 from ..discretization import Discretization
 from ..failures import needs_values
@@ -109,9 +110,14 @@ def _closure(surface: Discretization, held: Where | None) -> Closure | None:
     return eliminate(surface.cloud, conditions)
 
 
+@host_jit
+def _per_mass(g, mass):
+    return (g.T / mass).T
+
+
 def _smoothed(state: SobolevState, g: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
     on = state.operator.active
-    per_area = switched_off(on, (g.T / state.mass).T)
+    per_area = switched_off(on, _per_mass(g, state.mass))
     operator, inverse, _, closure = state
     found = solve(operator, per_area, closure=closure, preconditioner=inverse, mean_zero=False)
     return found.value

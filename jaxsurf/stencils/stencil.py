@@ -146,7 +146,7 @@ class Stencil(AbstractOperator):
         return _diagonal(self.weights, self.indices)
 
     def __rmul__(self, factor) -> Stencil:
-        return self._with(self.weights * self._own(factor, "factor"))
+        return self._with(_scaled(self.weights, self._own(factor, "factor")))
 
     def __add__(self, other) -> AbstractOperator:
         # What the same slots can hold is one stencil again.
@@ -157,7 +157,7 @@ class Stencil(AbstractOperator):
             return unchecked(Stencil, *fields)
         if isinstance(other, AbstractOperator) or self.in_shape or not self._starts_with_centers:
             return super().__add__(other)
-        return self._with(jnp.asarray(self.weights).at[0].add(self._own(other, "term")))
+        return self._with(_raised(self.weights, self._own(other, "term")))
 
     def _own(self, value, name: str):
         """A number or one number per point, in the precision of the weights."""
@@ -246,6 +246,17 @@ def _counts(count) -> str:
     count = np.asarray(count)
     low, high = count[count > 0].min(initial=count.max()), count.max()
     return f"{low}" if low == high else f"{low} to {high}"
+
+
+@host_jit
+def _scaled(weights, factor):
+    return weights * factor
+
+
+@host_jit
+def _raised(weights, term):
+    """With a term added to the slots of the centres."""
+    return namespace(weights).concatenate([weights[:1] + term, weights[1:]])
 
 
 @host_jit

@@ -264,7 +264,7 @@ def run(quick: bool, out: Path) -> list[Row]:
     largest = lambda error: float(np.abs(error).max())
     other = discretized(fine.cloud, js.GFDM(degree=4))
     collocated = js.eigenmodes(other.laplacian, _COUNT + 1).values[1:]
-    cloud = data.bunny(4_000)
+    cloud = data.bunny(2_000 if quick else 4_000)
     scanned = js.PointCloud(cloud.points, cloud.normals, boundary=cloud.boundary)
     _picture(out / "neural-bunny.png", js.discretize(scanned, method=_METHOD), fine, errors)
     about = {"n": n, "eigenvalues": _COUNT, "directions": _DIRECTIONS}

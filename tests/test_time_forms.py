@@ -272,17 +272,38 @@ def test_upwinding_mapped_and_in_single_precision():
     [
         (js.RKC2(), 1),
         (js.IMEX(order=3), 1),
-        # Newton's residual is another.
-        (js.SDIRK(order=3), 2),
+        # Newton's residual is at three more: its start, its derivative, its steps.
+        (js.SDIRK(order=3), 4),
         # So are steps of given length, which are looked at.
         (js.AdamsBashforth2(), 2),
     ],
     ids=lambda x: type(x).__name__,
 )
-def test_a_rate_stands_once_in_the_program(solver, places):
+def test_a_rate_stands_at_few_places_of_the_program(solver, places):
     """It may take seconds to compile."""
     problem = js.AdvectionDiffusionReaction(LAPLACIAN, reaction=lambda t, u, args: jax.lax.erf(u))
     given = dict(dt0=0.01) if isinstance(solver, js.AdamsBashforth2) else {}
     run = lambda u: js.integrate(problem, u, t1=0.1, solver=solver, **given).ys
     program = jax.make_jaxpr(run)(WAVE).jaxpr
     assert sum(op.primitive.name == "erf" for op in operations(program)) == places
+
+
+class Path(dfx.AbstractPath):
+    """Of two controls, t and t squared."""
+
+    t0: float = 0.0
+    t1: float = 1.0
+
+    def evaluate(self, t0, t1=None, left=True):
+        at = lambda t: jnp.stack([t, t**2])
+        return at(t0) if t1 is None else at(t1) - at(t0)
+
+
+@pytest.mark.parametrize("solver", [js.IMEX(order=3), js.SDIRK(order=3), js.AdamsBashforth2()])
+def test_rates_need_not_look_like_states(solver):
+    """With two controls a rate has two columns: x' = -x + 2 t, from 1."""
+    rate = lambda t, y, args: jnp.stack([-y, jnp.ones_like(y)], axis=1)
+    control, nothing = dfx.ControlTerm(rate, Path()), dfx.ODETerm(lambda t, y, args: 0 * y)
+    terms = dfx.MultiTerm(control, nothing) if isinstance(solver, js.IMEX) else control
+    end = dfx.diffeqsolve(terms, solver, 0.0, 1.0, 0.01, jnp.ones(3)).ys[-1]
+    np.testing.assert_allclose(end, 3 * np.exp(-1), rtol=1e-4)

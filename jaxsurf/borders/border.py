@@ -68,7 +68,6 @@ class Border(eqx.Module):
         return np.any(before != after, axis=1)
 
     @sized_jit
-    @sized_jit
     def conormals(self, cloud: PointCloud) -> Float[Array, "m d"]:
         """Outward unit conormals; at a corner the mean direction of both sides."""
         return _unit(jnp.sum(self._on_both_sides(cloud), axis=0))
@@ -80,7 +79,6 @@ class Border(eqx.Module):
         found = self.at(cloud, side, slot, cloud.points[self.points[slot]])[2]
         return found.reshape(2, m, -1)
 
-    @sized_jit
     def side_conormals(self, cloud: PointCloud, side: int) -> Float[Array, "m d"]:
         """Outward unit conormals of the piece before (0) or after (1) each point."""
         slot = jnp.arange(len(self.points))

@@ -62,7 +62,8 @@ class AdamsBashforth2(dfx.AbstractSolver):
 
     def init(self, terms, t0, t1, y0, args):
         # The first step finds it, where all others do.
-        none = jax.tree.map(jnp.zeros_like, y0)
+        rate = jax.eval_shape(lambda: terms.vf(t0, y0, args))
+        none = jax.tree.map(lambda k: jnp.zeros(k.shape, k.dtype), rate)
         return _State(none, none, jnp.zeros((), dtype_of(y0)))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):

@@ -185,7 +185,7 @@ class IMEX(_Implicit):
         return added(*(term.vf(t0, y0, args) for term in terms.terms))
 
     def init(self, terms, t0, t1, y0, args):
-        return _State.before(y0, 2)
+        return _State.before(terms.terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         terms, rates = frozen_at(terms, t0, y0, solver_state.rates)
@@ -268,7 +268,7 @@ class SDIRK(_Implicit):
         return terms.vf(t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args):
-        return _State.before(y0, 1)
+        return _State.before((terms,), t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         span = terms.contr(t0, t1)
@@ -290,25 +290,19 @@ class SDIRK(_Implicit):
                 target = tolerance * jnp.maximum(root_mean_square(start), root_mean_square(known))
 
                 def unfinished(carry):
-                    _, size, count = carry
-                    return (size > target) & (count <= self.newton_steps)
+                    _, r, count = carry
+                    return (root_mean_square(r) > target) & (count < self.newton_steps)
 
                 def improve(carry):
-                    y, _, count = carry
-                    r, slope = jax.linearize(residual, y)
-                    size = root_mean_square(r)
+                    y, r, count = carry
+                    slope = lx.FunctionLinearOperator(jax.linearize(residual, y)[1], structure)
+                    step = lx.linear_solve(slope, r, inner, options=options, throw=False).value
+                    y = jax.tree.map(jnp.subtract, y, step)
+                    return y, residual(y), count + 1
 
-                    def improved():
-                        matrix = lx.FunctionLinearOperator(slope, structure)
-                        step = lx.linear_solve(matrix, r, inner, options=options, throw=False)
-                        return jax.tree.map(jnp.subtract, y, step.value)
-
-                    further = (size > target) & (count < self.newton_steps)
-                    return jax.lax.cond(further, improved, lambda: y), size, count + 1
-
-                carry = (start, jnp.full_like(target, jnp.inf), 0)
-                y, size, _ = jax.lax.while_loop(unfinished, improve, carry)
-                return y, (size <= target).astype(size.dtype)
+                carry = (start, residual(start), 0)
+                y, r, _ = jax.lax.while_loop(unfinished, improve, carry)
+                return y, (root_mean_square(r) <= target).astype(root_mean_square(r).dtype)
 
             def tangent(slope, vector):
                 operator = lx.FunctionLinearOperator(slope, structure)
@@ -349,9 +343,10 @@ class _State(NamedTuple):
     known: Bool[Array, ""]
 
     @classmethod
-    def before(cls, y0: PyTree[Array], terms: int) -> _State:
-        """The first step, of so many terms."""
-        return cls((jax.tree.map(jnp.zeros_like, y0),) * terms, jnp.asarray(False))
+    def before(cls, terms, t0, y0: PyTree[Array], args) -> _State:
+        """The first step."""
+        rates = jax.eval_shape(lambda: tuple(term.vf(t0, y0, args) for term in terms))
+        return cls(jax.tree.map(lambda k: jnp.zeros(k.shape, k.dtype), rates), jnp.asarray(False))
 
 
 def _steps(tableau: Tableau, terms, solve, times, y0, args, state: _State, made_jump):

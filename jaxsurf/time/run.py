@@ -358,7 +358,7 @@ def _limit(u0, growth, t0: AnyArray, t1: AnyArray) -> AnyArray:
     xp, size = namespace(t0), root_mean_square(u0)
     # (Infinite times nothing would be no number.)
     grown = xp.where(xp.isfinite(growth), xp.exp(growth * abs(t1 - t0)), xp.inf)
-    return xp.where(size > 0, GROWN * size * grown, xp.where(xp.isfinite(grown), 0, xp.inf))
+    return xp.where(size > 0, GROWN * size * grown, xp.where(xp.isfinite(grown), 0 * size, xp.inf))
 
 
 @host_jit

@@ -16,7 +16,7 @@ from ..failures import is_concrete, warn
 @host_jit
 def length(y: PyTree[AnyArray]) -> Float[AnyArray, ""]:
     """Euclidean norm of all entries."""
-    leaves = jax.tree.leaves(y)
+    leaves = jax.tree.leaves(y) or [np.zeros(0)]
     return namespace(leaves[0]).sqrt(sum((leaf * leaf).sum() for leaf in leaves))
 
 

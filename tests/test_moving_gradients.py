@@ -13,7 +13,6 @@ import pytest
 
 import jaxsurf as js
 
-METHOD = js.GFDM(degree=4)
 DIFFUSIVITY = 0.1
 STEPS = dict(solver=dfx.Heun(), dt0=0.05)
 pytestmark = pytest.mark.slow

@@ -400,7 +400,7 @@ def test_free_form_keeps_its_parameters_where_the_reference_is_another():
         bulge, shape, jnp.zeros(200), optimizer=optax.sgd(0.2), steps=15, throw=False
     )
     assert found.history["renewed"].sum() >= 1 and target.shape == found.theta.shape
-    assert found.history["objective"][-1] < 0.1 * found.history["objective"][0]
+    assert found.history["objective"][-1] < 0.2 * found.history["objective"][0]
     apart = found.surface.cloud.points - found.shape.surface.cloud.points
     along = jnp.sum(apart * found.shape.surface.cloud.normals, axis=1)
     np.testing.assert_allclose(along, found.theta - found.shape.start, atol=1e-12)

@@ -162,10 +162,7 @@ def unreached(before, after, neighbors, share=_SKIN):
 
     def distances(slot):
         index, used = slot
-        return tuple(
-            xp.where(used, xp.sqrt(xp.sum((x[index] - x) ** 2, axis=-1)), 0)
-            for x in (before, after)
-        )
+        return tuple(xp.where(used, xp.sqrt(_squared(x, index)), 0) for x in (before, after))
 
     slots = (neighbors.indices.T, neighbors.mask.T)
     old, new = distances(slots) if xp is np else jax.lax.map(distances, slots)
@@ -173,6 +170,13 @@ def unreached(before, after, neighbors, share=_SKIN):
     outer = (old > 0.5 * farthest) & (old > 0)
     stretch = xp.min(xp.where(outer, new / xp.where(outer, old, 1), xp.inf), axis=0)
     return stretch * farthest < share * xp.max(new, axis=0)
+
+
+def _squared(x, index):
+    """Squares of distances to other points, `(*slots, n)`."""
+    if namespace(x) is np:  # which goes through long axes much faster than through short ones
+        return sum((a[index] - a) ** 2 for a in np.ascontiguousarray(x.T))
+    return jnp.sum((x[index] - x) ** 2, axis=-1)
 
 
 @host_jit

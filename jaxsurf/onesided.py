@@ -188,9 +188,7 @@ def _without_bound(neighbors: Neighbors, rows):
     return near, slots.T[1:], bound
 
 
-@host_jit
-def _shares(w):
-    return -w[1:] / w[0]
+_shares = host_jit(lambda w: -w[1:] / w[0])
 
 
 @host_jit
@@ -206,9 +204,7 @@ def _resolved(a, b, w):
     return pivot, -b * w[1:] / pivot
 
 
-@host_jit
-def _inverse(pivot):
-    return 1 / pivot
+_inverse = host_jit(lambda pivot: 1 / pivot)
 
 
 # Weights of one sign begin to take over where the curvature times the reach of a stencil is this,

@@ -3,7 +3,7 @@ r"""Implicit Runge–Kutta steps without matrices: every linear system by a Kryl
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import diffrax as dfx
 import equinox as eqx
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 from ..arguments import instance, real, whole
 from ..functions import numbers_as_arrays
@@ -185,10 +185,11 @@ class IMEX(_Implicit):
         return added(*(term.vf(t0, y0, args) for term in terms.terms))
 
     def init(self, terms, t0, t1, y0, args):
-        return _State.before(terms.terms, t0, y0, args)
+        return _before(terms.terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        terms, rates = frozen_at(terms, t0, y0, solver_state.rates)
+        rates, known = solver_state
+        terms, rates = frozen_at(terms, t0, y0, rates)
         implicit = terms.terms[1]
         span = implicit.contr(t0, t1)
         solver = relative(self.solver, self.tolerance, y0)
@@ -208,8 +209,7 @@ class IMEX(_Implicit):
             return y, dfx.RESULTS.promote(found.result)
 
         both = tuple(terms.terms)
-        state = _State(rates, solver_state.known)
-        return _steps(tableau, both, solve, (t0, t1), y0, args, state, made_jump)
+        return _steps(tableau, both, solve, (t0, t1), y0, args, (rates, known), made_jump)
 
 
 class SDIRK(_Implicit):
@@ -268,7 +268,7 @@ class SDIRK(_Implicit):
         return terms.vf(t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args):
-        return _State.before((terms,), t0, y0, args)
+        return _before((terms,), t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         span = terms.contr(t0, t1)
@@ -331,25 +331,13 @@ def _options(preconditioner: Preconditioner | None, shift, y0) -> dict:
 _FORCING = 1e-2
 
 
-class _State(NamedTuple):
-    """What one step hands to the next.
-
-    Args:
-        rates: of the terms at the current state; of none before the first step.
-        known: whether they are.
-    """
-
-    rates: tuple[PyTree[Array], ...]
-    known: Bool[Array, ""]
-
-    @classmethod
-    def before(cls, terms, t0, y0: PyTree[Array], args) -> _State:
-        """The first step."""
-        rates = jax.eval_shape(lambda: tuple(term.vf(t0, y0, args) for term in terms))
-        return cls(jax.tree.map(lambda k: jnp.zeros(k.shape, k.dtype), rates), jnp.asarray(False))
+def _before(terms, t0, y0, args) -> tuple:
+    """What the first step is handed: rates of none, and that they are not known."""
+    rates = jax.eval_shape(lambda: tuple(term.vf(t0, y0, args) for term in terms))
+    return jax.tree.map(lambda k: jnp.zeros(k.shape, k.dtype), rates), jnp.asarray(False)
 
 
-def _steps(tableau: Tableau, terms, solve, times, y0, args, state: _State, made_jump):
+def _steps(tableau: Tableau, terms, solve, times, y0, args, state, made_jump):
     """All stages of one step, for one term (implicit) or two (explicit, implicit).
 
     One loop, in which a solve and the rates after it, which take seconds to compile, stand once.
@@ -357,11 +345,12 @@ def _steps(tableau: Tableau, terms, solve, times, y0, args, state: _State, made_
 
     Args:
         solve: (t, r, start) -> y with y - γ Δt f(t, y) = r, and its result code.
-        state: of the step before.
+        state: rates of the terms at the start, from the step before, and whether they are known.
         made_jump: True if rates jump at the start.
     """
     t0, t1 = times
-    fresh = jnp.asarray(made_jump) | ~state.known
+    rates, known = state
+    fresh = jnp.asarray(made_jump) | ~known
     span = [term.contr(t0, t1) for term in terms]
     count, real = len(tableau.nodes), dtype_of(y0)
     matrices = zip((tableau.explicit, tableau.implicit), tableau.weights)
@@ -390,7 +379,7 @@ def _steps(tableau: Tableau, terms, solve, times, y0, args, state: _State, made_
         room = jax.tree.map(lambda r, k: r.at[i].set(k, mode="drop"), room, new)
         return (y, rates, room, ok), None
 
-    (y1, rates, room, ok), _ = jax.lax.scan(turn, (y0, state.rates, room, fine), rows)
+    (y1, rates, room, ok), _ = jax.lax.scan(turn, (y0, rates, room, fine), rows)
     total = added(*room)
     zero = jax.tree.map(jnp.zeros_like, y0)
     error = _combined(zero, jnp.asarray(tableau.errors, real), total)
@@ -400,7 +389,7 @@ def _steps(tableau: Tableau, terms, solve, times, y0, args, state: _State, made_
     y1 = jax.tree.map(lambda y: jnp.where(solved, y, jnp.nan), y1)
     k0 = jax.tree.map(lambda k: k[0], total)
     k1 = added(*(term.prod(rate, s) for term, rate, s in zip(terms, rates, span)))
-    return y1, error, dict(y0=y0, y1=y1, k0=k0, k1=k1), _State(rates, solved), ok
+    return y1, error, dict(y0=y0, y1=y1, k0=k0, k1=k1), (rates, solved), ok
 
 
 def _combined(y: PyTree[Array], weights: Array, increments: PyTree[Array]) -> PyTree[Array]:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from .states import dtype_of
+from .states import dtype_of, zeros_like_result
 
 
 class _State(NamedTuple):
@@ -62,8 +62,7 @@ class AdamsBashforth2(dfx.AbstractSolver):
 
     def init(self, terms, t0, t1, y0, args):
         # The first step finds it, where all others do.
-        rate = jax.eval_shape(lambda: terms.vf(t0, y0, args))
-        none = jax.tree.map(lambda k: jnp.zeros(k.shape, k.dtype), rate)
+        none = zeros_like_result(lambda: terms.vf(t0, y0, args))
         return _State(none, none, jnp.zeros((), dtype_of(y0)))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from ..arguments import real, whole
 from ..functions import numbers_as_arrays
 from .chebyshev import End, Loop, Radius, Step
-from .states import dtype_of
+from .states import dtype_of, zeros_like_result
 
 # Steps between two estimates of the spectral radius, applications in the first and in later ones.
 _REFRESH, _FIRST, _LATER = 25, 20, 4
@@ -115,8 +115,7 @@ class RKC2(dfx.AbstractAdaptiveSolver):
 
     def init(self, terms, t0, t1, y0, args):
         # The first step finds it, where all others do.
-        rate = jax.eval_shape(lambda: terms.vf(t0, y0, args))
-        rate = jax.tree.map(lambda k: jnp.zeros(k.shape, k.dtype), rate)
+        rate = zeros_like_result(lambda: terms.vf(t0, y0, args))
         radius, direction = self.spectral_radius, None
         if radius is None:
             radius, direction = 0, jax.tree.map(_noise, y0)

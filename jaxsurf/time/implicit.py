@@ -17,7 +17,7 @@ from ..arguments import instance, real, whole
 from ..functions import numbers_as_arrays
 from .phases import frozen_at
 from .relative import relative, tolerance_of
-from .states import added, dtype_of, root_mean_square
+from .states import added, dtype_of, root_mean_square, zeros_like_result
 
 Preconditioner = Callable[[Any], lx.AbstractLinearOperator]
 
@@ -188,7 +188,7 @@ class IMEX(_Implicit):
         return _before(terms.terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        rates, known = solver_state
+        rates, are_known = solver_state
         terms, rates = frozen_at(terms, t0, y0, rates)
         implicit = terms.terms[1]
         span = implicit.contr(t0, t1)
@@ -209,7 +209,7 @@ class IMEX(_Implicit):
             return y, dfx.RESULTS.promote(found.result)
 
         both = tuple(terms.terms)
-        return _steps(tableau, both, solve, (t0, t1), y0, args, (rates, known), made_jump)
+        return _steps(tableau, both, solve, (t0, t1), y0, args, (rates, are_known), made_jump)
 
 
 class SDIRK(_Implicit):
@@ -333,8 +333,8 @@ _FORCING = 1e-2
 
 def _before(terms, t0, y0, args) -> tuple:
     """What the first step is handed: rates of none, and that they are not known."""
-    rates = jax.eval_shape(lambda: tuple(term.vf(t0, y0, args) for term in terms))
-    return jax.tree.map(lambda k: jnp.zeros(k.shape, k.dtype), rates), jnp.asarray(False)
+    rates = zeros_like_result(lambda: tuple(term.vf(t0, y0, args) for term in terms))
+    return rates, jnp.asarray(False)
 
 
 def _steps(tableau: Tableau, terms, solve, times, y0, args, state, made_jump):
@@ -349,8 +349,8 @@ def _steps(tableau: Tableau, terms, solve, times, y0, args, state, made_jump):
         made_jump: True if rates jump at the start.
     """
     t0, t1 = times
-    rates, known = state
-    fresh = jnp.asarray(made_jump) | ~known
+    rates, are_known = state
+    fresh = jnp.asarray(made_jump) | ~are_known
     span = [term.contr(t0, t1) for term in terms]
     count, real = len(tableau.nodes), dtype_of(y0)
     matrices = zip((tableau.explicit, tableau.implicit), tableau.weights)

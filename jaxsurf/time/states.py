@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,6 +31,11 @@ def root_mean_square(y: PyTree[AnyArray]) -> Float[AnyArray, ""]:
 def added(*trees: PyTree[Array]) -> PyTree[Array]:
     """The sum of states, or of rates."""
     return jax.tree.map(lambda first, *others: sum(others, first), *trees)
+
+
+def zeros_like_result(f: Callable, *args) -> PyTree[Array]:
+    """In place of what a function returns, such as a rate that is still to be found."""
+    return jax.tree.map(lambda k: jnp.zeros(k.shape, k.dtype), jax.eval_shape(f, *args))
 
 
 def only_on(active: Bool[Array | np.ndarray, " n"] | None, tree: PyTree) -> PyTree:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import contextvars
 import functools
 import gc
@@ -16,10 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 
 from .arguments import is_array
 from .failures import is_concrete
-from .machine import CPU, PIECE, QUICK, QUICKEST, machine
+from .machine import PIECE, QUICK, QUICKEST, machine
 
 if TYPE_CHECKING:
     AnyArray = Any  # the kind that goes in comes out
@@ -40,29 +41,55 @@ def is_quick() -> bool:
     return quickly.get()
 
 
-_postponing, _thresholds, _lock = 0, gc.get_threshold(), threading.Lock()
+# Objects made, fewer those given back, as long as full collections wait after what was traced.
+_AFTERWARDS, _NEVER = 350_000, 1_000_000
+_postponing, _left, _thresholds, _lock = 0, 0, gc.get_threshold(), threading.Lock()
 
 
-@contextlib.contextmanager
-def without_full_collections():
-    """Within it, in any thread, full collections of garbage wait; the young are collected as ever.
+def without_full_collections(f: Callable) -> Callable:
+    """In calls of it, in any thread, full collections of garbage wait; the young are as ever.
 
     What is traced is no garbage and there is much of it: going through all objects of the process
-    again and again takes a good part of the time of tracing.
+    again and again takes a good part of the time of tracing. They wait for a while after a call
+    that is traced, too, as it is transposed then.
     """
-    global _postponing, _thresholds
-    with _lock:
-        if not _postponing:
-            _thresholds = gc.get_threshold()
-            gc.set_threshold(*_thresholds[:2], 1_000_000)
-        _postponing += 1
-    try:
-        yield
-    finally:
+
+    @functools.wraps(f)
+    def call(*args):
+        global _postponing, _left, _thresholds
         with _lock:
-            _postponing -= 1
-            if not _postponing:
-                gc.set_threshold(*_thresholds)
+            if not _postponing and not _left:
+                _thresholds = gc.get_threshold()
+                gc.set_threshold(*_thresholds[:2], _NEVER)
+            _postponing += 1
+        try:
+            return f(*args)
+        finally:
+            with _lock:
+                _postponing -= 1
+                if not is_concrete(args):
+                    _left = 1 + _AFTERWARDS // max(_thresholds[0], 1)  # young collections
+                _collect_again()
+
+    return call
+
+
+def _collect_again():
+    asked_for_since = gc.get_threshold()[2] != _NEVER
+    if not (_postponing or _left or asked_for_since):
+        gc.set_threshold(*_thresholds)
+
+
+def _after_collection(phase, _):
+    global _left
+    # Whoever holds the lock may be who collects: it is not waited for.
+    if _left and phase == "stop" and _lock.acquire(blocking=False):
+        _left -= 1
+        _collect_again()
+        _lock.release()
+
+
+gc.callbacks.append(_after_collection)
 
 
 def sized_jit(f: Callable) -> Callable:
@@ -91,7 +118,7 @@ def _by_size(f: Callable, thorough: Callable, quick: Callable) -> Callable:
     """The second of two programs of a function where the arrays are small."""
 
     @functools.wraps(f)
-    @without_full_collections()
+    @without_full_collections
     def call(*args):
         if _takes_longer_to_compile(jax.tree.leaves(args)):
             try:
@@ -154,7 +181,7 @@ class Pieces:
         functools.update_wrapper(self, f)
         self.programs = _programs(f)
 
-    @without_full_collections()
+    @without_full_collections
     def __call__(self, blocks, *args):
         leaves = jax.tree.leaves((blocks, args))
         if len(leaves[0]) and _takes_longer_to_compile(leaves):
@@ -266,9 +293,34 @@ def stored(a: jax.Array, never) -> jax.Array:
     Args:
         never: False, which the compiler cannot know.
     """
-    if machine() is not CPU:
-        return jax.lax.optimization_barrier(a)
-    return jax.lax.cond(never, jnp.zeros_like, lambda a: a, a)
+    return _stored.bind(a, never)
+
+
+# A primitive, as derivatives keep this form then, and nothing of the branch that is never taken.
+_stored = Primitive("stored")
+_stored.def_impl(lambda a, never: a)
+_stored.def_abstract_eval(lambda a, never: a)
+ad.primitive_jvps[_stored] = lambda primals, tangents: (
+    stored(*primals),
+    tangents[0] if type(tangents[0]) is ad.Zero else stored(tangents[0], primals[1]),
+)
+ad.primitive_transposes[_stored] = lambda cotangent, a, never: (
+    cotangent if type(cotangent) is ad.Zero else stored(cotangent, never),
+    None,
+)
+
+
+def _stored_of_each(arrays, axes):
+    (a, never), (axis, several) = arrays, axes
+    return stored(a, never if several is None else jnp.any(never)), axis
+
+
+batching.primitive_batchers[_stored] = _stored_of_each
+for _platform, _way in {
+    None: lambda a, never: jax.lax.optimization_barrier(a),
+    "cpu": lambda a, never: jax.lax.cond(never, jax.lax.optimization_barrier, lambda a: a, a),
+}.items():
+    mlir.register_lowering(_stored, mlir.lower_fun(_way, multiple_results=False), _platform)
 
 
 def in_batches(f: Callable, xs, size: int):

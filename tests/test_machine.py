@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import subprocess
 import sys
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -73,8 +74,30 @@ def test_the_environment_may_ask_for_the_form_that_compiles_faster(said, quick, 
     assert done.stdout.strip() == str(quick)
 
 
+def test_what_is_stored_is_the_same_and_has_every_derivative():
+    a, never = jnp.arange(6.0).reshape(2, 3), jnp.array(False)
+    f = lambda a, never: compiling.stored(a, never) ** 3
+    for g in (f, jax.jit(f)):
+        np.testing.assert_array_equal(g(a, never), a**3)
+        np.testing.assert_array_equal(jax.vmap(g, (0, None))(a, never), a**3)
+        np.testing.assert_array_equal(jax.vmap(g)(a, jnp.zeros(2, bool)), a**3)
+        np.testing.assert_array_equal(jax.vmap(g, (None, 0))(a, jnp.zeros(2, bool))[1], a**3)
+        total = lambda a: g(a, never).sum()
+        np.testing.assert_array_equal(jax.grad(total)(a), 3 * a**2)
+        slope = lambda a: jax.grad(total)(a).sum()
+        np.testing.assert_array_equal(jax.grad(slope)(a), 6 * a)
+        np.testing.assert_array_equal(jax.jvp(jax.grad(total), (a,), (a,))[1], 6 * a * a)
+
+
+def _thresholds():
+    """Of collections, none of which wait any longer for what was traced before."""
+    while compiling._left:
+        gc.collect(0)
+    return gc.get_threshold()
+
+
 def test_full_collections_of_garbage_wait_and_come_back():
-    before = gc.get_threshold()
+    before = _thresholds()
     seen = []
 
     @compiling.sized_jit
@@ -92,9 +115,45 @@ def test_full_collections_of_garbage_wait_and_come_back():
     with pytest.raises(RuntimeError):
         fails(jnp.ones(3))
     assert gc.get_threshold() == before
-    # Others' threads may come in between: the last one restores what the first one found.
-    first, second = compiling.without_full_collections(), compiling.without_full_collections()
-    first.__enter__(), second.__enter__(), first.__exit__(None, None, None)
+
+
+def test_full_collections_wait_for_what_is_transposed_and_come_back():
+    before = _thresholds()
+    double = compiling.sized_jit(lambda x: 2 * x)
+    jax.grad(lambda x: double(x).sum())(jnp.ones(3))
     assert gc.get_threshold()[2] > before[2]
-    second.__exit__(None, None, None)
+    double(jnp.ones(3))  # what is not traced leaves it at that
+    for _ in range(compiling._left):
+        assert gc.get_threshold()[2] > before[2]
+        gc.collect(0)
+    assert gc.get_threshold() == before
+
+
+def test_thresholds_set_in_between_stay():
+    before = _thresholds()
+    try:
+        jax.jit(compiling.sized_jit(lambda x: 2 * x))(jnp.ones(3))
+        gc.set_threshold(500, 5, 5)
+        for _ in range(compiling._left):
+            gc.collect(0)
+        assert gc.get_threshold() == (500, 5, 5)
+    finally:
+        gc.set_threshold(*before)
+
+
+def test_full_collections_wait_for_the_last_of_several_threads():
+    before, at, go_on = _thresholds(), threading.Event(), threading.Event()
+
+    def waits(x):
+        at.set()
+        assert go_on.wait(60)
+        return x
+
+    first = threading.Thread(target=compiling.without_full_collections(waits), args=(1,))
+    first.start()
+    assert at.wait(60)
+    compiling.without_full_collections(lambda: None)()
+    assert gc.get_threshold()[2] > before[2]
+    go_on.set()
+    first.join()
     assert gc.get_threshold() == before

@@ -197,7 +197,7 @@ def solve(run: Run) -> tuple[dfx.Solution, Verdict | None]:
     return (_solved_moving if run.moving else _solved)(run)
 
 
-@without_full_collections()
+@without_full_collections
 def _solution(run: Run) -> tuple[dfx.Solution, Verdict | None]:
     verdict = run.judged()
     refused = jnp.asarray(False) if verdict is None else ~verdict.stable

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..compiling import kept
-from .sums import total
+from .sums import sums, total
 
 
 def taper(s: Float[Array, "*q"]) -> Float[Array, "*q"]:
@@ -82,7 +82,8 @@ def support(
 
 def _soft_radius(r2, mask, target, dim):
     # The point itself counts, also in rows that are switched off.
-    return jnp.exp(_log_radius(r2, mask.at[0].set(True), target))
+    mask = jnp.concatenate([jnp.ones_like(mask[:1]), mask[1:]])
+    return jnp.exp(_log_radius(r2, mask, target))
 
 
 @jax.custom_jvp
@@ -133,8 +134,8 @@ def _log_radius_jvp(primals, tangents):
 def _counted(r2, mask, t):
     """The weights $(1 - s)^3$ of all points, $s = r^2 / e^{2t}$, and their derivative in t."""
     s = jnp.minimum(r2 * jnp.exp(-2 * t), 1)
-    count = total(jnp.where(mask, (1 - s) ** 3, 0))
-    return count, total(jnp.where(mask, 6 * s * (1 - s) ** 2, 0))
+    left = jnp.where(mask, 1 - s, 0)
+    return sums([left**3, 6 * s * left**2], 0)
 
 
 def enclosing(r2: Float[Array, "k *p"], mask: Bool[Array, "k *p"]) -> Float[Array, "*p"]:

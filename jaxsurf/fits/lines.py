@@ -45,23 +45,25 @@ def functionals(
     """
     basis = position(len(x), high)
     if steep:
-        found = _on_steep(x, w, high)
+        found = _on_steep(list(x), w, high)
         return [found[g] for g in basis]
     # Coordinates in another order for each line, and the monomials accordingly.
     steepest, turns = _steepest(x), range(1, len(x) + 1)
-    each = jnp.broadcast_to(steepest, x.shape)
-    found = _on_steep(jax.lax.select_n(each, *(jnp.roll(x, -i, 0) for i in turns)), w, high)
+    each, twice = jnp.broadcast_to(steepest, w.shape), [*x, *x]
+    turned = [jax.lax.select_n(each, *(twice[a + i] for i in turns)) for a in range(len(x))]
+    found = _on_steep(turned, w, high)
     return [jax.lax.select_n(steepest, *(found[g[i:] + g[:i]] for i in turns)) for g in basis]
 
 
 def _on_steep(x, w, high) -> dict[tuple[int, ...], Array]:
     """The same by multi-index, with the last coordinate as the parameter of all lines."""
-    along = x[:, -1] - x[:, 0]
+    along = [x_i[-1] - x_i[0] for x_i in x]
     # Lines without a weight may have any slope, or none.
-    rise = jnp.where(2 * abs(along[-1]) > jnp.max(abs(along), axis=0), along[-1], 1)
-    slopes = along[:-1] / rise
-    feet = x[:-1, 0] - slopes * x[-1, 0]
-    feet, slopes, heights = list(feet), list(slopes), list(x[-1])
+    longest = functools.reduce(jnp.maximum, map(abs, along))
+    rise = jnp.where(2 * abs(along[-1]) > longest, along[-1], 1)
+    slopes = [along_i / rise for along_i in along[:-1]]
+    feet = [x_i[0] - slope * x[-1][0] for x_i, slope in zip(x, slopes)]
+    heights = list(x[-1])
     add, times = jax.lax.add, jax.lax.mul
     terms, found = list(w), {}
     for c in range(high + 1):
@@ -126,7 +128,7 @@ def _solve(x, w, b, low, high):
     solve, condition = systems.factor(gram)
     b = b.astype(w.dtype).reshape(*b.shape, *(1,) * (w.ndim - 2))
     a = kept(solve(jnp.broadcast_to(b, (*b.shape[:2], *w.shape[2:]))))
-    eta = weights(a)
+    eta = kept(weights(a))
     error = jnp.max(jnp.abs(systems.symmetric(gram, a) - b), axis=(0, 1))
     size = jnp.max(jnp.abs(b), axis=(0, 1))
     return (eta, condition, error / jnp.where(size > 0, size, 1)), (solve, a)

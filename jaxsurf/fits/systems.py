@@ -139,35 +139,22 @@ def _in_columns(a) -> bool:
 
 def _by_columns(a, shift):
     """Cholesky's factor and its inverse column by column, for all points at once."""
-    m, columns = len(a), _cholesky(a, shift)
-    pivot = _diagonal(columns)
-
-    def substitute(b):
-        def forward(i, y):
-            left = _at(b, i) - total(_at(columns, i, 1)[:, None] * y)
-            return _put(y, left / _at(pivot, i), i)
-
-        def backward(j, x):
-            i = np.uint32(m - 1) - j
-            left = _at(y, i) - total(_at(columns, i)[:, None] * x)
-            return _put(x, left / _at(pivot, i), i)
-
-        y = _loop(m, forward, jnp.zeros_like(b), b)
-        return _loop(m, backward, jnp.zeros_like(b), b)
+    columns = _cholesky(a, shift)
 
     def times(x):
         rows = jnp.sum(columns[:, :, None] * x, axis=1)
         return jnp.sum(columns[:, :, None] * rows[:, None], axis=0) - shift * x
 
     def solution(_, b):
-        return _loop(2, lambda _, x: substitute(b + shift * x), jnp.zeros_like(b), b)
+        again = lambda _, x: _substituted(columns, b + shift * x)
+        return _while(2, again, jnp.zeros_like(b))
 
     def solve(b, refined):
         if not refined:
-            return substitute(b)
+            return _substituted(columns, b)
         return jax.lax.custom_linear_solve(times, b, solution, symmetric=True)
 
-    return solve, pivot
+    return solve, _diagonal(columns)
 
 
 def _cholesky(a, shift):
@@ -189,33 +176,66 @@ def _cholesky(a, shift):
     return columns
 
 
-def _eliminated(rows, shift):
+def _while(count: int, body: Callable, start):
+    """`fori_loop` that counts once, by numbers without a sign, which need no code for negative
+    ones. Each operation on a number is a program for the compiler. Not for reverse mode."""
+    step = lambda state: (state[0] + np.uint32(1), body(*state))
+    return jax.lax.while_loop(lambda state: state[0] < count, step, (np.uint32(0), start))[1]
+
+
+def _scan(count: int, body: Callable, start):
+    """The same for any derivative."""
+    step = lambda state, i: (body(i, state), None)
+    return jax.lax.scan(step, start, np.arange(count, dtype=np.uint32))[0]
+
+
+def _with_loops(f: Callable) -> Callable:
+    """A function of a kind of loop and of arrays as one of the arrays."""
+    call = jax.custom_jvp(functools.partial(f, _while))
+    call.defjvp(lambda primals, tangents: jax.jvp(functools.partial(f, _scan), primals, tangents))
+    return functools.wraps(f)(call)
+
+
+@_with_loops
+def _eliminated(loop, rows, shift):
     """The first columns of a factor, of as many rows of a symmetric matrix."""
-    count, m = rows.shape[:2]
-    places = np.arange(m, dtype=np.uint32).reshape(m, *(1,) * (rows.ndim - 2))
+    places = _places(rows[0])
 
     def eliminate(j, columns):
-        # Columns that are not there yet are zero.
-        column = _at(rows, j) - jnp.sum(columns * _at(columns, j, 1)[:, None], axis=0)
-        column = jnp.where(places == j, column + shift, column)
-        column = jnp.where(places < j, 0, column * jax.lax.rsqrt(_at(column, j)))
+        # Those that are not there yet have no part. (Masks are factors: constants, zeros say, the
+        # compiler takes out of a loop and stores, by a program of their own.)
+        before = (places[: len(rows)] < j) * _at(columns, j, 1)
+        column = _at(rows, j) - jnp.sum(columns * before[:, None], axis=0)
+        column = column + shift * (places == j)
+        column = column * ((places >= j) * jax.lax.rsqrt(_at(column, j)))
         return _put(columns, column, j)
 
-    return _loop(count, eliminate, jnp.zeros_like(rows), rows)
+    return loop(len(rows), eliminate, rows)
 
 
-def _loop(count: int, body: Callable, start, data):
-    """`fori_loop` over numbers without a sign, which need no code for negative ones.
+@_with_loops
+def _substituted(loop, columns, b):
+    """The solution, of which an entry takes the place of that of b once it is found."""
+    m, pivot, places = len(b), _diagonal(columns), _places(b[:, 0])
 
-    The first number hangs on the data, if for show: what hangs on numbers alone reverse mode takes
-    out of a loop, computes in a loop of its own and stores.
-    """
-    zero = (data[(0,) * data.ndim] < -jnp.inf).astype(np.uint32)
+    def forward(i, y):
+        row = (places < i) * _at(columns, i, 1)
+        left = _at(b, i) - total(row[:, None] * y)
+        return _put(y, left / _at(pivot, i), i)
 
-    def step(state, _):
-        return (state[0] + np.uint32(1), body(*state)), None
+    def backward(j, x):
+        i = np.uint32(m - 1) - j
+        column = (places > i) * _at(columns, i)
+        left = _at(y, i) - total(column[:, None] * x)
+        return _put(x, left / _at(pivot, i), i)
 
-    return jax.lax.scan(step, (zero, start), length=count)[0][1]
+    y = loop(m, forward, b)
+    return loop(m, backward, y)
+
+
+def _places(a):
+    """Numbers of the entries of the first axis."""
+    return np.arange(len(a), dtype=np.uint32).reshape(-1, *(1,) * (a.ndim - 1))
 
 
 def _at(a, i, axis: int = 0):
@@ -247,7 +267,8 @@ def _by_lapack(a, shift):
 
 
 def _diagonal(a):
-    return a[np.arange(len(a)), np.arange(len(a))]
+    m = len(a)
+    return a.reshape(m * m, *a.shape[2:])[:: m + 1]
 
 
 def _times(a, v):

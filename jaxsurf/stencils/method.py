@@ -13,7 +13,7 @@ from ..arguments import as_float, real, whole
 from ..fits.kernels import gaussian, taper
 from ..fits.monomials import polynomial_count
 from ..fits.plane import Neighborhood, dot
-from ..fits.sums import total
+from ..fits.sums import sums, total
 from .targets import AbstractTarget, Joint, Laplacian
 
 
@@ -60,13 +60,12 @@ class Diagnostics(eqx.Module):
             total(inside),
             support,
             jnp.full(support.shape, layers, jnp.int32),
-            jnp.max(jnp.where(inside, _bend(around), 0), axis=0) * support,
+            jnp.max(jnp.where(inside, _bend(around, r2), 0), axis=0) * support,
         )
 
 
-def _bend(around: Neighborhood) -> Float[Array, "k *p"]:
+def _bend(around: Neighborhood, r2) -> Float[Array, "k *p"]:
     """Normal curvature on the way to each neighbour, as the normals tell it."""
-    r2 = around.squared
     turn = dot(around.offsets, around.normals - around.normals[0])
     return jnp.where(r2 > 0, jnp.abs(turn) / jnp.where(r2 > 0, r2, 1), 0)
 
@@ -169,12 +168,13 @@ def _calmed(method: AbstractMethod, around: Neighborhood, weights, support):
     others = total(jnp.abs(weights[1:]))
     share = jnp.where(others > 0, -weights[0] / jnp.where(others > 0, others, 1), -jnp.inf)
     short = ramp((method.least_dominance - share) / _SHORT)
+    squared = around.squared
 
     @jax.checkpoint
     def calmed():
         # Without a jump where neighbours enter the support.
-        s = around.squared / support**2
-        tube = support * power_mean(_bend(around), jnp.where(around.mask, taper(s), 0))
+        s = squared / support**2
+        tube = power_mean(support * _bend(around, squared), jnp.where(around.mask, taper(s), 0))
         early = ramp(1 - share / _SHORT) / 2
         if around.border is not None:
             early = jnp.where(around.border, 0, early)
@@ -189,32 +189,32 @@ def _calmed(method: AbstractMethod, around: Neighborhood, weights, support):
 
 @jax.custom_jvp
 def power_mean(values: Float[Array, "k *p"], counted: Float[Array, "k *p"]) -> Float[Array, "*p"]:
-    """Nearly the largest, and no more than it; smooth also where several are the largest."""
+    """Nearly the largest, and no more than it; smooth also where several are the largest.
+
+    Those above 4 count as 4, whose powers single precision holds.
+    """
     return _power_mean(values, counted)[0]
 
 
 def _power_mean(values, counted):
-    """The mean; and what its derivative needs: shares of the largest, and sums, 1 for none."""
-    largest = jnp.max(values, axis=0)
-    unit = jnp.where(largest > 0, largest, 1)
-    share = values / unit
-    powers = total(counted * share**_POWER)
+    """The mean; and the sums that it is made of, 1 for none."""
+    powers, count = sums([counted * jnp.minimum(values, _MOST) ** _POWER, counted], 0)
     found = powers > 0
-    powers, count = (jnp.where(found, a, 1) for a in (powers, total(counted)))
-    mean = jnp.where(found, unit * (powers / count) ** (1 / _POWER), 0)
-    return mean, (unit, share, powers, count)
+    powers, count = (jnp.where(found, a, 1) for a in (powers, count))
+    return jnp.where(found, (powers / count) ** (1 / _POWER), 0), (powers, count)
 
 
 @power_mean.defjvp
 def _power_mean_jvp(primals, tangents):
-    (_, counted), (moved, more) = primals, tangents
-    mean, (unit, share, powers, count) = _power_mean(*primals)
-    below = share ** (_POWER - 1)
-    grown = total(below * (share * more + counted * _POWER * (moved / unit))) / powers
-    return mean, mean / _POWER * (grown - total(more) / count)
+    (values, counted), (moved, more) = primals, tangents
+    mean, (powers, count) = _power_mean(values, counted)
+    moved, values = jnp.where(values < _MOST, moved, 0), jnp.minimum(values, _MOST)
+    grown = values ** (_POWER - 1) * (values * more + _POWER * counted * moved)
+    grown, more = sums([grown, more], 0)
+    return mean, mean / _POWER * (grown / powers - more / count)
 
 
-_POWER = 32
+_POWER, _MOST = 32, 4
 
 
 @jax.custom_jvp
@@ -280,4 +280,5 @@ def needed_polynomials(degree: int, dim: int, target: AbstractTarget) -> int:
 
 def with_center(eta: Float[Array, "c k *p"]) -> Float[Array, "c k *p"]:
     """Weights that sum to zero: those of the neighbours as given, the centre's made up."""
-    return eta.at[:, 0].set(-total(eta[:, 1:], axis=1))
+    others = eta[:, 1:]
+    return jnp.concatenate([-total(others, axis=1)[:, None], others], axis=1)

@@ -74,19 +74,20 @@ def test_the_environment_may_ask_for_the_form_that_compiles_faster(said, quick, 
     assert done.stdout.strip() == str(quick)
 
 
-def test_what_is_stored_is_the_same_and_has_every_derivative():
-    a, never = jnp.arange(6.0).reshape(2, 3), jnp.array(False)
+@pytest.mark.parametrize("compiled", [False, True])
+def test_what_is_stored_is_the_same_and_has_every_derivative(compiled):
     f = lambda a, never: compiling.stored(a, never) ** 3
-    for g in (f, jax.jit(f)):
-        np.testing.assert_array_equal(g(a, never), a**3)
-        np.testing.assert_array_equal(jax.vmap(g, (0, None))(a, never), a**3)
-        np.testing.assert_array_equal(jax.vmap(g)(a, jnp.zeros(2, bool)), a**3)
-        np.testing.assert_array_equal(jax.vmap(g, (None, 0))(a, jnp.zeros(2, bool))[1], a**3)
-        total = lambda a: g(a, never).sum()
-        np.testing.assert_array_equal(jax.grad(total)(a), 3 * a**2)
-        slope = lambda a: jax.grad(total)(a).sum()
-        np.testing.assert_array_equal(jax.grad(slope)(a), 6 * a)
-        np.testing.assert_array_equal(jax.jvp(jax.grad(total), (a,), (a,))[1], 6 * a * a)
+    f = jax.jit(f) if compiled else f
+    a, never, each = jnp.arange(6.0).reshape(2, 3), jnp.array(False), jnp.zeros(2, bool)
+    total = lambda a: f(a, never).sum()
+    slope = lambda a: jax.grad(total)(a).sum()
+    np.testing.assert_array_equal(f(a, never), a**3)
+    for axes, b in (((0, None), never), ((0, 0), each), ((None, 0), each)):
+        found = jax.vmap(f, axes)(a, b)
+        np.testing.assert_array_equal(found, a**3 if axes[0] == 0 else [a**3, a**3])
+    np.testing.assert_array_equal(jax.grad(total)(a), 3 * a**2)
+    np.testing.assert_array_equal(jax.grad(slope)(a), 6 * a)
+    np.testing.assert_array_equal(jax.jvp(jax.grad(total), (a,), (a,))[1], 6 * a * a)
 
 
 def _thresholds():

@@ -100,16 +100,14 @@ def carried(gradient, normals, before, after):
     upright = crossed(new)
 
     # Where nothing moves they stay as they are, however large that error is.
-    def turn(normal, length):
+    def turn(_, found):
+        normal, length = found
         ahead = normal * (length if dim == 2 else jnp.sqrt(length))[:, None]
         normal = (upright + lean(ahead)) / size[:, None]
         length = jnp.sqrt(jnp.sum(normal**2, axis=1))
         return normal / jnp.where(length > 0, length, 1)[:, None], length
 
-    normal, length = normals, jnp.ones_like(normals[:, 0])
-    for _ in range(_TURNS):
-        normal, length = turn(normal, length)
-    return normal, length
+    return jax.lax.fori_loop(0, _TURNS, turn, (normals, jnp.ones_like(normals[:, 0])))
 
 
 def crossed(tangents):

@@ -79,11 +79,13 @@ def _on_steep(x, w, high) -> dict[tuple[int, ...], Array]:
     return found
 
 
+@functools.partial(jax.jit, static_argnums=(2, 3))
 def moments(x, w, high, steep):
     """What all lines together make of the monomials up to a degree, graded; see `functionals`."""
     return jnp.stack(sums(functionals(x, w, high, steep), 0))
 
 
+@functools.partial(jax.jit, static_argnums=(3, 4, 5))
 def _weights(a, x, w, low, high, steep):
     """Sums over each line of w times the polynomials with coefficients a."""
     found = functionals(x, w, high, steep)[len(multi_indices(len(x), 0, low - 1)) :]

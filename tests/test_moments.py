@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 
 from jaxsurf.fits.kernels import gaussian, support, taper
 from jaxsurf.fits.lines import are_steep, line_solve
@@ -306,6 +307,25 @@ def test_derivative_of_support():
     r2 = jnp.asarray(np.sort(np.random.default_rng(0).uniform(0, 1, 30)))
     r2 = r2.at[0].set(0)
     check_derivative(lambda r: support(r, jnp.ones(30, bool), dim=2), r2, rtol=1e-7)
+
+
+@pytest.mark.parametrize("nearest", [1e-6, 2e-4, 0.01])
+def test_support_of_a_list_most_of_which_is_far(nearest):
+    r2 = jnp.asarray([0, nearest, *np.linspace(0.3, 1, 14)]) ** 2
+    found = support(r2, jnp.ones(16, bool), dim=3)
+    target = 0.76 * 16 / 105 * 16
+    counted = lambda radius: np.sum(np.maximum(1 - r2 / radius**2, 0) ** 3)
+    expected = scipy.optimize.brentq(lambda radius: counted(radius) - target, 1e-8, 1, xtol=1e-15)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_support_reads_nothing_that_is_switched_off():
+    r2 = jnp.asarray(np.random.default_rng(0).uniform(0, 1, (12, 3))).at[0].set(0)
+    mask = jnp.ones((12, 3), bool).at[5:8, 1].set(False)
+    expected = support(r2, mask, dim=2)
+    for nothing in (jnp.nan, jnp.inf):
+        found = support(jnp.where(mask, r2, nothing), mask, dim=2)
+        np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("dim, rise", [(2, 1), (2, 0.05), (3, 1), (3, 0.05), (3, None)])

@@ -6,8 +6,11 @@ not jump when a neighbour enters or leaves.
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..compiling import kept
@@ -75,55 +78,55 @@ def support(
     Differentiable: forward and reverse; the root by the implicit function theorem.
     """
     if radius is None:
-        target = _SHARE * _MEAN_WEIGHT[dim] * total(mask)
-        return _soft_radius(r2, mask, jnp.maximum(target, 1.2), dim)
+        # The point itself counts, also in rows that are switched off.
+        mask = jnp.concatenate([jnp.ones_like(mask[:1]), mask[1:]])
+        return jnp.exp(_log_radius(r2, mask, _SHARE * _MEAN_WEIGHT[dim]))
     return jnp.broadcast_to(jnp.asarray(radius, r2.dtype), r2.shape[1:])
 
 
-def _soft_radius(r2, mask, target, dim):
-    # The point itself counts, also in rows that are switched off.
-    mask = jnp.concatenate([jnp.ones_like(mask[:1]), mask[1:]])
-    return jnp.exp(_log_radius(r2, mask, target))
-
-
-@jax.custom_jvp
-def _log_radius(r2, mask, target):
-    """Where the weights `_counted` add up to the target; derivatives, of any order, in r2."""
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _log_radius(r2, mask, share):
+    """Where the weights `_counted` add up to a share of the points; derivatives, of any order, in
+    r2."""
 
     # Reverse mode takes the rule below off what it keeps. To be differentiated once more, that is a
     # step from where the loop ends, which is no function of anything.
     still = jax.lax.stop_gradient(r2)
+    count, squared = sums([mask.astype(r2.dtype), jnp.where(mask, still, 0)], 0)
+    target = jnp.maximum(share * count, 1.2)
 
     def newton(state):
         # In an even set log(count) is a straight line in t = log(radius), nearly; where a step
         # leaves the bracket, it is halved instead.
-        low, high, t, _, steps = state
+        (low, high, t), _, steps = state
         value, slope = _counted(still, mask, t)
         low, high = jnp.where(value < target, t, low), jnp.where(value < target, high, t)
         step = t + jnp.log(target / value) * value / jnp.maximum(slope, 1e-3 * value)
         inside = (step >= low) & (step <= high)
         new = jnp.where(inside, step, (low + high) / 2)
-        return low, high, new, jnp.max(jnp.abs(new - t)), steps + 1
+        # One array, and a product for a maximum: fewer kernels to compile.
+        return jnp.stack([low, high, new]), jnp.vdot(new - t, new - t), steps + np.uint32(1)
 
     def moving(state):
         # The last step below is one more, and squares what error is left.
-        return (state[3] > jnp.finfo(r2.dtype).eps ** 0.5) & (state[4] < 50)
+        return (state[1] > jnp.finfo(r2.dtype).eps) & (state[2] < 50)
 
     # A disc that is filled evenly out to the radius R has a mean r^2 of R^2 / 2, a ball of any
     # dimension about that; the share of the list that is wanted takes part of it.
-    mean = total(jnp.where(mask, still, 0)) / total(mask)
-    start = 0.5 * jnp.log(jnp.where(mean > 0, 2 * _SHARE * mean, 1))
+    start = 0.5 * jnp.log(jnp.where(squared > 0, 2 * _SHARE * squared / count, 1))
+    # Where most of the list is far from the few that reach the target, far below.
+    bracket = jnp.stack([start - 20, start + 5, start])
     infinite = jnp.asarray(jnp.inf, r2.dtype)
-    t = jax.lax.while_loop(moving, newton, (start - 5, start + 5, start, infinite, 0))[2]
+    t = jax.lax.while_loop(moving, newton, (bracket, infinite, np.uint32(0)))[0][2]
     value, slope = _counted(r2, mask, t)
     return t + (target - value) / jnp.maximum(slope, 1e-3)
 
 
 @_log_radius.defjvp
-def _log_radius_jvp(primals, tangents):
+def _log_radius_jvp(share, primals, tangents):
     # The implicit function theorem; the target is a number of points.
-    r2, mask, target = primals
-    t = kept(_log_radius(r2, mask, target))
+    r2, mask = primals
+    t = kept(_log_radius(r2, mask, share))
     _, slope = _counted(r2, mask, t)
     unit = jnp.exp(-2 * t)
     s = jnp.minimum(r2 * unit, 1)
@@ -133,9 +136,8 @@ def _log_radius_jvp(primals, tangents):
 
 def _counted(r2, mask, t):
     """The weights $(1 - s)^3$ of all points, $s = r^2 / e^{2t}$, and their derivative in t."""
-    s = jnp.minimum(r2 * jnp.exp(-2 * t), 1)
-    left = jnp.where(mask, 1 - s, 0)
-    return sums([left**3, 6 * s * left**2], 0)
+    s = jnp.where(mask, jnp.minimum(r2 * jnp.exp(-2 * t), 1), 1)
+    return sums([(1 - s) ** 3, 6 * s * (1 - s) ** 2], 0)
 
 
 def enclosing(r2: Float[Array, "k *p"], mask: Bool[Array, "k *p"]) -> Float[Array, "*p"]:

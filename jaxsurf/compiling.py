@@ -41,9 +41,10 @@ def is_quick() -> bool:
     return quickly.get()
 
 
-# Objects made, fewer those given back, as long as full collections wait after what was traced.
-_AFTERWARDS, _NEVER = 350_000, 1_000_000
-_postponing, _left, _thresholds, _lock = 0, 0, gc.get_threshold(), threading.Lock()
+# Objects made, fewer those given back, as long as full collections wait after what was traced; and
+# a threshold that nobody else asks for.
+_AFTERWARDS, _NEVER = 350_000, 1_000_003
+_postponing, _left, _threshold, _lock = 0, _AFTERWARDS, gc.get_threshold()[2], threading.RLock()
 
 
 def without_full_collections(f: Callable) -> Callable:
@@ -51,42 +52,48 @@ def without_full_collections(f: Callable) -> Callable:
 
     What is traced is no garbage and there is much of it: going through all objects of the process
     again and again takes a good part of the time of tracing. They wait for a while after a call
-    that is traced, too, as it is transposed then.
+    that is traced, too, as it is transposed then; but that once only between two of them.
     """
 
     @functools.wraps(f)
     def call(*args):
-        global _postponing, _left, _thresholds
+        global _postponing, _threshold
+        traced = not is_concrete(args)
         with _lock:
-            if not _postponing and not _left:
-                _thresholds = gc.get_threshold()
-                gc.set_threshold(*_thresholds[:2], _NEVER)
+            youngest, young, full = gc.get_threshold()
+            if full != _NEVER:
+                _threshold = full
+                gc.set_threshold(youngest, young, _NEVER)
             _postponing += 1
         try:
             return f(*args)
         finally:
             with _lock:
                 _postponing -= 1
-                if not is_concrete(args):
-                    _left = 1 + _AFTERWARDS // max(_thresholds[0], 1)  # young collections
-                _collect_again()
+                if not (traced and _left > 0):
+                    _collect_again()
 
     return call
 
 
 def _collect_again():
-    asked_for_since = gc.get_threshold()[2] != _NEVER
-    if not (_postponing or _left or asked_for_since):
-        gc.set_threshold(*_thresholds)
+    youngest, young, full = gc.get_threshold()
+    if full == _NEVER and not _postponing:
+        gc.set_threshold(youngest, young, _threshold)
 
 
-def _after_collection(phase, _):
+def _after_collection(phase, info):
     global _left
     # Whoever holds the lock may be who collects: it is not waited for.
-    if _left and phase == "stop" and _lock.acquire(blocking=False):
-        _left -= 1
-        _collect_again()
-        _lock.release()
+    if phase == "start" or not _lock.acquire(blocking=False):
+        return
+    if info["generation"] == 2:
+        _left = _AFTERWARDS
+    elif not _postponing and gc.get_threshold()[2] == _NEVER:
+        _left -= max(gc.get_threshold()[0], 1)
+        if _left <= 0:
+            _collect_again()
+    _lock.release()
 
 
 gc.callbacks.append(_after_collection)

@@ -107,7 +107,8 @@ def carried(gradient, normals, before, after):
         length = jnp.sqrt(jnp.sum(normal**2, axis=1))
         return normal / jnp.where(length > 0, length, 1)[:, None], length
 
-    return jax.lax.fori_loop(0, _TURNS, turn, (normals, jnp.ones_like(normals[:, 0])))
+    start = normals.astype(jnp.result_type(normals, upright)), jnp.ones_like(size)
+    return jax.lax.fori_loop(0, _TURNS, turn, start)
 
 
 def crossed(tangents):

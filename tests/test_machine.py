@@ -92,9 +92,17 @@ def test_what_is_stored_is_the_same_and_has_every_derivative(compiled):
 
 def _thresholds():
     """Of collections, none of which wait any longer for what was traced before."""
-    while compiling._left:
-        gc.collect(0)
+    _wait_no_longer()
+    gc.collect()
     return gc.get_threshold()
+
+
+def _wait_no_longer() -> int:
+    young = 0
+    while gc.get_threshold()[2] == compiling._NEVER:
+        gc.collect(0)
+        young += 1
+    return young
 
 
 def test_full_collections_of_garbage_wait_and_come_back():
@@ -121,25 +129,37 @@ def test_full_collections_of_garbage_wait_and_come_back():
 def test_full_collections_wait_for_what_is_transposed_and_come_back():
     before = _thresholds()
     double = compiling.sized_jit(lambda x: 2 * x)
-    jax.grad(lambda x: double(x).sum())(jnp.ones(3))
-    assert gc.get_threshold()[2] > before[2]
-    double(jnp.ones(3))  # what is not traced leaves it at that
-    for _ in range(compiling._left):
-        assert gc.get_threshold()[2] > before[2]
-        gc.collect(0)
+    slope = jax.grad(lambda x: double(x).sum())
+    slope(jnp.ones(3))
+    assert gc.get_threshold() == (*before[:2], compiling._NEVER)
+    assert _wait_no_longer() == -(-compiling._AFTERWARDS // before[0])
+    assert gc.get_threshold() == before
+    slope(jnp.ones(3))  # not again, until there was one
+    assert gc.get_threshold() == before
+    gc.collect()
+    slope(jnp.ones(3))
+    assert gc.get_threshold() != before
+    double(jnp.ones(3))  # what is not traced ends it
     assert gc.get_threshold() == before
 
 
-def test_thresholds_set_in_between_stay():
+@pytest.mark.parametrize("given", [(500,), (500, 5), (500, 5, 5)])
+def test_thresholds_set_in_between_stay(given):
     before = _thresholds()
     try:
         jax.jit(compiling.sized_jit(lambda x: 2 * x))(jnp.ones(3))
-        gc.set_threshold(500, 5, 5)
-        for _ in range(compiling._left):
-            gc.collect(0)
-        assert gc.get_threshold() == (500, 5, 5)
+        gc.set_threshold(*given)
+        _wait_no_longer()
+        assert gc.get_threshold() == (*given, *before[len(given) :])
     finally:
         gc.set_threshold(*before)
+
+
+def test_thresholds_come_back_after_what_cannot_be_called():
+    before = _thresholds()
+    with pytest.raises(ValueError, match="key"):
+        compiling.sized_jit(lambda d: 1)({1: jnp.ones(2), "a": jnp.ones(2)})
+    assert gc.get_threshold() == before
 
 
 def test_full_collections_wait_for_the_last_of_several_threads():

@@ -10,6 +10,8 @@ import scipy.spatial.transform
 
 import jaxsurf as js
 from jaxsurf import operators
+from jaxsurf.fits.plane import Neighborhood
+from jaxsurf.stencils.targets import Laplacian
 
 from .helpers import KINDS, METHODS, exponential, jittered_sphere, label, made_in, relative_error
 
@@ -337,3 +339,21 @@ def test_compiled_builds_store_no_neighbourhoods():
     np.testing.assert_allclose(primal, found, rtol=1e-9, atol=1e-9 * float(jnp.abs(found).max()))
     # Points and normals that are stretched alike would be of degree -2; these normals stay.
     np.testing.assert_allclose(slope, -2 * found, atol=1e-6 * float(jnp.abs(found).max()))
+
+
+@pytest.mark.parametrize("method", [js.DCPSE(order=2), js.GFDM(degree=2)])
+def test_a_neighbourhood_may_be_that_of_one_point(method):
+    cloud = js.sphere(300)
+    lists = np.asarray(js.find_neighbors(cloud, k=40).indices[:4]).T
+    columns = [list(np.asarray(a).T) for a in (cloud.points, cloud.normals)]
+
+    @jax.jit
+    def weights(points, normals):
+        mask = jnp.ones(points[0].shape, bool)
+        around = Neighborhood.of(points, normals, mask, None, None)
+        return method.weights(around, Laplacian())[0]
+
+    read = lambda lists: [[jnp.asarray(x[lists]) for x in vectors] for vectors in columns]
+    block, one = weights(*read(lists)), weights(*read(lists[:, 0]))
+    assert one.shape == (40,)
+    np.testing.assert_allclose(one, block[:, 0], atol=1e-12 * float(abs(block).max()))

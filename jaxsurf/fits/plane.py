@@ -32,7 +32,9 @@ class Neighborhood(eqx.Module):
         """From the coordinates of the neighbours and of their normals, axis by axis."""
         # The point itself stands in slot 0. Stored, as the derivative of a whole stencil would be
         # found again for each coordinate. (No component of a unit normal is 2.)
-        offsets = stored(jnp.stack([x - x[0] for x in points], axis=1), normals[0][0, 0] > 2)
+        offsets = stored(
+            jnp.stack([x - x[0] for x in points], axis=1), normals[0][(0,) * normals[0].ndim] > 2
+        )
         return cls(offsets, jnp.stack(normals, axis=1), mask, radius, border)
 
     def support(self, dim: int, given: float | None) -> Float[Array, "*p"]:
@@ -81,7 +83,8 @@ class TangentPlane(eqx.Module):
             radius = around.support(around.offsets.shape[1] - 1, support)
             unit = radius * width
             # The compiler would find the factors again for every use of their product.
-            weights = stored(gaussian(around.squared, unit, radius, around.mask), unit[0] < 0)
+            never = unit[(0,) * unit.ndim] < 0
+            weights = stored(gaussian(around.squared, unit, radius, around.mask), never)
             plane = cls.at(around.normals[0], around.offsets, weights, unit, radius)
             # For accelerators: on a CPU the compiler looks through it.
             return jax.lax.optimization_barrier(plane)

@@ -178,7 +178,8 @@ def _cholesky(a, shift):
 
 def _while(count: int, body: Callable, start):
     """`fori_loop` that counts once, by numbers without a sign, which need no code for negative
-    ones. Each operation on a number is a program for the compiler. Not for reverse mode."""
+    ones. Each operation on a number is a program for the compiler. Not for reverse mode, which
+    solves of linear systems do not need."""
     step = lambda state: (state[0] + np.uint32(1), body(*state))
     return jax.lax.while_loop(lambda state: state[0] < count, step, (np.uint32(0), start))[1]
 

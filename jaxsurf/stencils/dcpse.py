@@ -97,7 +97,7 @@ class DCPSE(AbstractMethod):
             jnp.stack([dot(a, axis[None]) for axis in frame])
             for a in (neighborhood.offsets, neighborhood.normals)
         )
-        never = width[0] < 0
+        never = width[(0,) * width.ndim] < 0
         offsets, along = stored(offsets / width, never), step * normals
         x = jnp.stack([offsets + m * along for m in range(-count, count + 1)], 1)
         x = stored(x, never)

@@ -189,32 +189,32 @@ def _calmed(method: AbstractMethod, around: Neighborhood, weights, support):
 
 @jax.custom_jvp
 def power_mean(values: Float[Array, "k *p"], counted: Float[Array, "k *p"]) -> Float[Array, "*p"]:
-    """Nearly the largest, and no more than it; smooth also where several are the largest.
-
-    Those above 4 count as 4, whose powers single precision holds.
-    """
+    """Nearly the largest, and no more than it; smooth also where several are the largest."""
     return _power_mean(values, counted)[0]
 
 
 def _power_mean(values, counted):
-    """The mean; and the sums that it is made of, 1 for none."""
-    powers, count = sums([counted * jnp.minimum(values, _MOST) ** _POWER, counted], 0)
+    """The mean; and what its derivative needs: shares of the largest, and sums, 1 for none."""
+    largest = jnp.max(values, axis=0)
+    unit = jnp.where(largest > 0, largest, 1)
+    share = values / unit
+    powers, count = sums([counted * share**_POWER, counted], 0)
     found = powers > 0
     powers, count = (jnp.where(found, a, 1) for a in (powers, count))
-    return jnp.where(found, (powers / count) ** (1 / _POWER), 0), (powers, count)
+    mean = jnp.where(found, unit * (powers / count) ** (1 / _POWER), 0)
+    return mean, (unit, share, powers, count)
 
 
 @power_mean.defjvp
 def _power_mean_jvp(primals, tangents):
-    (values, counted), (moved, more) = primals, tangents
-    mean, (powers, count) = _power_mean(values, counted)
-    moved, values = jnp.where(values < _MOST, moved, 0), jnp.minimum(values, _MOST)
-    grown = values ** (_POWER - 1) * (values * more + _POWER * counted * moved)
-    grown, more = sums([grown, more], 0)
+    (_, counted), (moved, more) = primals, tangents
+    mean, (unit, share, powers, count) = _power_mean(*primals)
+    below = share ** (_POWER - 1)
+    grown, more = sums([below * (share * more + counted * _POWER * (moved / unit)), more], 0)
     return mean, mean / _POWER * (grown / powers - more / count)
 
 
-_POWER, _MOST = 32, 4
+_POWER = 32
 
 
 @jax.custom_jvp

@@ -32,6 +32,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .borders.border import Border
 from .cloud import PointCloud
 from .compiling import sized_jit
+from .fits import systems
 from .fits.kernels import gaussian
 from .fits.plane import Neighborhood, TangentPlane, dot
 from .neighbors import Neighbors
@@ -118,8 +119,9 @@ class Pairs(eqx.Module):
         """The inverse of the derivative of `rest`, applied."""
         h = self.kernel * _positive(self.forces(mu))[1]
         own = jnp.sum((h * self.near)[:, None] * self.near, axis=2)
-        own = own + _SLACK * jnp.eye(len(own), dtype=h.dtype)[..., None] * self.unit
-        inverse = jax.lax.stop_gradient(jnp.linalg.inv(own.transpose(2, 0, 1)).transpose(1, 2, 0))
+        one = jnp.eye(len(own), dtype=h.dtype)[..., None] * jnp.ones_like(self.unit)
+        invert, _ = systems.factor(jax.lax.stop_gradient(own + _SLACK * one * self.unit))
+        inverse = invert(one, refined=False)
         precondition = lambda r: jnp.sum(inverse * r, axis=1)
         apply = lambda v: self.moments(h * self.forces(v)) + _SLACK * self.unit * v
         solve = lambda apply, r: _conjugate_gradients(apply, r, precondition, rtol)

@@ -77,12 +77,14 @@ def without_full_collections(f: Callable) -> Callable:
 
 
 def _collect_again():
+    """The threshold of full collections as it was, unless there are calls or others set another."""
     youngest, young, full = gc.get_threshold()
     if full == _NEVER and not _postponing:
         gc.set_threshold(youngest, young, _threshold)
 
 
 def _after_collection(phase, info):
+    """Counts what is made after traced calls; a full collection begins the count anew."""
     global _left
     # Whoever holds the lock may be who collects: it is not waited for.
     if phase == "start" or not _lock.acquire(blocking=False):
@@ -328,6 +330,11 @@ for _platform, _way in {
     "cpu": lambda a, never: jax.lax.cond(never, jax.lax.optimization_barrier, lambda a: a, a),
 }.items():
     mlir.register_lowering(_stored, mlir.lower_fun(_way, multiple_results=False), _platform)
+
+
+def first(a: jax.Array) -> jax.Array:
+    """The first entry, whatever axes there are: what `stored` may be told to be never."""
+    return a[(0,) * a.ndim]
 
 
 def in_batches(f: Callable, xs, size: int):

@@ -86,8 +86,7 @@ def support(
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def _log_radius(r2, mask, share):
-    """Where the weights `_counted` add up to a share of the points; derivatives, of any order, in
-    r2."""
+    """Where the weights `_counted` add up to a share of the points; any derivative, in r2."""
 
     # Reverse mode takes the rule below off what it keeps. To be differentiated once more, that is a
     # step from where the loop ends, which is no function of anything.

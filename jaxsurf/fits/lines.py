@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..compiling import is_quick, kept, stored
+from ..compiling import first, is_quick, kept, stored
 from . import systems
 from .moments import add_moved_moments, all_moments, arranged, columns, moved
 from .monomials import monomial_rows, monomials, multi_indices, polynomial_count, position
@@ -56,7 +56,7 @@ def functionals(
 
 
 def _on_steep(x, w, high) -> dict[tuple[int, ...], Array]:
-    """The same by multi-index, with the last coordinate as the parameter of all lines."""
+    """The same by multi-index, with the last of the coordinates x as the parameter of all lines."""
     along = [x_i[-1] - x_i[0] for x_i in x]
     # Lines without a weight may have any slope, or none.
     longest = functools.reduce(jnp.maximum, map(abs, along))
@@ -149,7 +149,7 @@ def _line_solve_jvp(low, high, primals, tangents):
     if x.ndim > 2 and systems.is_written_out(polynomial_count(len(x), high)):
         v, a = monomial_rows(x, high), systems.entries(a)
     else:
-        v = stored(monomials(x, high), w[(0,) * w.ndim] < 0)
+        v = stored(monomials(x, high), first(w) < 0)
     dx = columns(dx, v, w)
     s = systems.found_once(systems.combine(a, v[start:]), v, w)
     g = dw * s + w * moved(a, v, dx, start, high)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..compiling import AnyArray, namespace, stored
+from ..compiling import AnyArray, first, namespace, stored
 from ..frames import axes_of
 from ..kept import Kept, once
 from .kernels import gaussian, support
@@ -32,9 +32,7 @@ class Neighborhood(eqx.Module):
         """From the coordinates of the neighbours and of their normals, axis by axis."""
         # The point itself stands in slot 0. Stored, as the derivative of a whole stencil would be
         # found again for each coordinate. (No component of a unit normal is 2.)
-        offsets = stored(
-            jnp.stack([x - x[0] for x in points], axis=1), normals[0][(0,) * normals[0].ndim] > 2
-        )
+        offsets = stored(jnp.stack([x - x[0] for x in points], axis=1), first(normals[0]) > 2)
         return cls(offsets, jnp.stack(normals, axis=1), mask, radius, border)
 
     def support(self, dim: int, given: float | None) -> Float[Array, "*p"]:
@@ -49,8 +47,7 @@ class Neighborhood(eqx.Module):
         Stored, as those that are found again may differ in the last bit: the derivative of the
         largest looks for that which is equal to it.
         """
-        never = self.normals[(0,) * self.normals.ndim] > 2
-        return stored(dot(self.offsets, self.offsets), never)
+        return stored(dot(self.offsets, self.offsets), first(self.normals) > 2)
 
 
 class TangentPlane(eqx.Module):
@@ -83,8 +80,7 @@ class TangentPlane(eqx.Module):
             radius = around.support(around.offsets.shape[1] - 1, support)
             unit = radius * width
             # The compiler would find the factors again for every use of their product.
-            never = unit[(0,) * unit.ndim] < 0
-            weights = stored(gaussian(around.squared, unit, radius, around.mask), never)
+            weights = stored(gaussian(around.squared, unit, radius, around.mask), first(unit) < 0)
             plane = cls.at(around.normals[0], around.offsets, weights, unit, radius)
             # For accelerators: on a CPU the compiler looks through it.
             return jax.lax.optimization_barrier(plane)

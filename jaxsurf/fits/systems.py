@@ -191,7 +191,7 @@ def _scan(count: int, body: Callable, start):
 
 
 def _with_loops(f: Callable) -> Callable:
-    """A function of a kind of loop and of arrays as one of the arrays."""
+    """From f(loop, *arrays) a function of the arrays: by `while`, in derivatives by `scan`."""
     call = jax.custom_jvp(functools.partial(f, _while))
     call.defjvp(lambda primals, tangents: jax.jvp(functools.partial(f, _scan), primals, tangents))
     return functools.wraps(f)(call)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..compiling import stored
+from ..compiling import first, stored
 from ..fits.kernels import gaussian, taper
 from ..fits.lines import line_solve
 from ..fits.moments import moment_solve
@@ -97,7 +97,7 @@ class DCPSE(AbstractMethod):
             jnp.stack([dot(a, axis[None]) for axis in frame])
             for a in (neighborhood.offsets, neighborhood.normals)
         )
-        never = width[(0,) * width.ndim] < 0
+        never = first(width) < 0
         offsets, along = stored(offsets / width, never), step * normals
         x = jnp.stack([offsets + m * along for m in range(-count, count + 1)], 1)
         x = stored(x, never)

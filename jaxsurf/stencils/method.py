@@ -168,7 +168,7 @@ def _calmed(method: AbstractMethod, around: Neighborhood, weights, support):
     others = total(jnp.abs(weights[1:]))
     share = jnp.where(others > 0, -weights[0] / jnp.where(others > 0, others, 1), -jnp.inf)
     short = ramp((method.least_dominance - share) / _SHORT)
-    squared = around.squared
+    squared = around.squared  # found already; within the branch it would be once more
 
     @jax.checkpoint
     def calmed():
